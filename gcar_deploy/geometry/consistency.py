@@ -1,0 +1,79 @@
+"""Do two pictures show the same tree? The vessel mass of every epipolar plane must agree."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.epipolar import plane_angles
+from gcar_deploy.types import Array, Image, Pixels, Scalars
+
+#: bins of a profile: width at the isocentre, and how many to each side of it
+BIN_MM = 0.25
+HALF_BINS = 600
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mass:
+    """Vessel pixels of one view with their share of the view's mass.
+
+    Attributes
+    ----------
+    carm : CArm
+    pixels : (n, 2) (col, row)
+    share : (n,) sums to 1
+    """
+
+    carm: CArm
+    pixels: Pixels
+    share: Scalars
+
+
+def vessel_mass(carm: CArm, path_mm: Image) -> Mass | None:
+    """Collect the pixels with vessel; None where there is none.
+
+    Parameters
+    ----------
+    carm : CArm of the picture's size
+    path_mm : (rows, cols) path length, any scale, zero outside vessels
+    """
+    rows, cols = np.nonzero(path_mm > 0)
+    if len(rows) == 0:
+        return None
+    mass = path_mm[rows, cols].astype(np.float64)
+    return Mass(carm, np.column_stack([cols, rows]).astype(np.float64), mass / mass.sum())
+
+
+def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tuple[Array, Array]:
+    """Mass per epipolar plane in both views, smoothed.
+
+    Parameters
+    ----------
+    fixed, moving : Mass of the two views
+    carm : CArm to use for ``moving`` in place of its own (a corrected pose)
+    sigma_mm : smoothing, mm at the isocentre
+
+    Returns
+    -------
+    two (2 HALF_BINS + 1,) arrays, each summing to 1 unless vessel lies outside all bins
+    """
+    reach = 0.5 * float(np.linalg.norm(fixed.carm.source_mm) + np.linalg.norm(carm.source_mm))
+    out = []
+    for mass, view in ((fixed, fixed.carm), (moving, carm)):
+        at = plane_angles(fixed.carm, carm, view, mass.pixels) * reach / BIN_MM + HALF_BINS
+        low = np.clip(np.floor(at).astype(np.int64), 0, 2 * HALF_BINS - 1)
+        part = np.clip(at - low, 0.0, 1.0)
+        n = 2 * HALF_BINS + 1
+        profile = np.bincount(low, mass.share * (1 - part), n)
+        profile += np.bincount(low + 1, mass.share * part, n)
+        out.append(gaussian_filter1d(profile, sigma_mm / BIN_MM, mode="constant"))
+    return out[0], out[1]
+
+
+def disagreement(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> float:
+    """Half the summed difference of both profiles: 0 (equal) .. 1 (nothing in common)."""
+    a, b = mass_profiles(fixed, moving, carm, sigma_mm)
+    return float(0.5 * np.abs(a - b).sum())

@@ -1,0 +1,86 @@
+"""Two views: epipolar lines and planes, and points from pixels of several views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.types import Array, Pixels, Points, Scalars
+
+
+def fundamental_matrix(first: CArm, second: CArm) -> Array:
+    """(3, 3) F with x2^T F x1 = 0 for homogeneous pixels (col, row, 1) of one point.
+
+    F = [e2]x P2 P1^+, e2 the projection of the first source in the second view
+    (Hartley and Zisserman, Multiple View Geometry, eq. 9.1). Scaled to unit norm.
+    """
+    P1, P2 = first.world2pixel, second.world2pixel
+    e2 = P2 @ np.append(first.source_mm, 1.0)
+    cross = np.array([[0, -e2[2], e2[1]], [e2[2], 0, -e2[0]], [-e2[1], e2[0], 0]])
+    F = cross @ P2 @ np.linalg.pinv(P1)
+    return F / np.linalg.norm(F)
+
+
+def epipolar_lines(first: CArm, second: CArm, pixels: Pixels) -> Array:
+    """(n, 3) lines (a, b, c) in the second view for (n, 2) pixels of the first.
+
+    a col + b row + c is the signed distance from the line in pixels of the second view.
+    """
+    pixels = np.asarray(pixels, dtype=np.float64)
+    lines = np.column_stack([pixels, np.ones(len(pixels))]) @ fundamental_matrix(first, second).T
+    return lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+
+
+def triangulate(carms: Sequence[CArm], pixels: Sequence[Pixels]) -> tuple[Points, Scalars]:
+    """Find the points nearest to one ray per view, in the least-squares sense.
+
+    Parameters
+    ----------
+    carms : sequence of v CArm, v >= 2
+    pixels : sequence of v arrays (n, 2), (col, row) of the same n points
+
+    Returns
+    -------
+    points_mm : (n, 3) mm LPS
+    residual_mm : (n,) root mean square distance from the rays, mm
+    """
+    n = len(pixels[0])
+    normal, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    across = []
+    for carm, uv in zip(carms, pixels, strict=True):
+        rays = carm.rays(uv)
+        # I - r r^T takes out the direction along the ray, in which nothing is measured.
+        Q = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        across.append((Q, carm.source_mm))
+        normal += Q
+        right += Q @ carm.source_mm
+    points: Array = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    squares = [np.sum(((Q @ (points - s)[:, :, None])[:, :, 0]) ** 2, axis=1) for Q, s in across]
+    return points, np.sqrt(np.mean(squares, axis=0))
+
+
+def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scalars:
+    """Angle of the epipolar plane through each (n, 2) pixel of ``carm``, radians.
+
+    Planes of the pair (first, second) turn about the line through both sources; zero is the
+    plane through the isocentre. ``carm`` is one of the pair.
+    """
+    base = second.source_mm - first.source_mm
+    base = base / np.linalg.norm(base)
+    towards = -first.source_mm - (-first.source_mm @ base) * base
+    e1 = towards / np.linalg.norm(towards)
+    e2 = np.cross(base, e1)
+    rays = carm.rays(pixels)
+    return np.arctan2(rays @ e2, rays @ e1)
+
+
+def plane_normal(first: CArm, second: CArm) -> Array:
+    """(3,) unit normal of the epipolar plane through the isocentre: the visible direction.
+
+    Motion along it shows in the pictures; motion within the plane does not.
+    """
+    normal = np.cross(first.axes[2], second.axes[2])
+    length = float(np.linalg.norm(normal))
+    return normal / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])

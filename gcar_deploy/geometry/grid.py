@@ -1,0 +1,69 @@
+"""Grid: a regular block of voxels, axis-parallel to LPS."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from gcar_deploy.errors import GeometryError
+from gcar_deploy.types import Array, Points
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Voxel block; array index [i, j, k] runs along x (left), y (posterior), z (head).
+
+    Attributes
+    ----------
+    center_mm : (3,) middle of the block, mm LPS
+    size_mm : (3,) full edge lengths, mm
+    shape : (3,) number of voxels along x, y, z
+    """
+
+    center_mm: tuple[float, float, float]
+    size_mm: tuple[float, float, float]
+    shape: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        if any(not math.isfinite(c) or abs(c) > 2000 for c in self.center_mm):
+            raise GeometryError(
+                f"volume.center_mm = {self.center_mm!r} is outside -2000 .. 2000 mm"
+            )
+        if any(not math.isfinite(s) or not 1 <= s <= 2000 for s in self.size_mm):
+            raise GeometryError(f"volume.size_mm = {self.size_mm!r} is outside 1 .. 2000 mm")
+        if any(int(n) != n or not 1 <= n <= 1024 for n in self.shape):
+            raise GeometryError(f"volume.shape = {self.shape!r} is outside 1 .. 1024 voxels")
+        if math.prod(self.shape) > 2**28:
+            raise GeometryError(f"volume.shape = {self.shape!r} has more than 2^28 voxels")
+
+    @property
+    def spacing_mm(self) -> Array:
+        """(3,) voxel edge lengths, mm."""
+        return np.asarray(self.size_mm, dtype=np.float64) / np.asarray(self.shape)
+
+    @property
+    def lower_mm(self) -> Array:
+        """(3,) outer corner of voxel [0, 0, 0], mm LPS."""
+        return np.asarray(self.center_mm) - 0.5 * np.asarray(self.size_mm)
+
+    def index2world(self, index: Array) -> Points:
+        """(n, 3) voxel indices, whole or fractional, to mm LPS; integers are voxel centres."""
+        return self.lower_mm + (np.asarray(index, dtype=np.float64) + 0.5) * self.spacing_mm
+
+    def world2index(self, points_mm: Points) -> Array:
+        """(n, 3) mm LPS to fractional voxel indices."""
+        return (np.asarray(points_mm, dtype=np.float64) - self.lower_mm) / self.spacing_mm - 0.5
+
+    def affine_ras(self) -> Array:
+        """(4, 4) voxel index to mm RAS, as NIfTI wants it."""
+        affine = np.eye(4)
+        affine[:3, :3] = np.diag(self.spacing_mm * (-1, -1, 1))
+        affine[:3, 3] = self.index2world(np.zeros((1, 3)))[0] * (-1, -1, 1)
+        return affine
+
+    def corners_mm(self) -> Points:
+        """(8, 3) outer corners, mm LPS."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return np.asarray(self.center_mm) + 0.5 * signs * np.asarray(self.size_mm)

@@ -1,0 +1,198 @@
+"""What several views can know of a point: Cramer-Rao bounds, and what stays silent.
+
+The bound of a point from pixel noise sigma_px is C = sigma_px^2 (J^T J)^-1 with J the stacked
+Jacobians of all views. Two views at angle theta, parallel beams and s = sigma_px times the pixel
+at the isocentre give the closed form RMSE = s sqrt(1/2 + 2 / sin^2 theta).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.types import Array, Points, Scalars
+
+#: singular values below this share of the largest count as zero
+RELATIVE_CUTOFF = 1e-6
+#: a view that looks along the vessel within this angle measures nothing of it
+ALONG_BEAM_DEG = 5.0
+#: bounds between the classes, in units of the noise at the isocentre
+WEAK, NONE = 3.0, 10.0
+
+
+class Observability(enum.IntEnum):
+    """How well a centreline point is determined across the vessel."""
+
+    GOOD = 0
+    WEAK = 1
+    NONE = 2
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GeometryPrior:
+    """One standard deviation of what a scene file may be wrong by, per view."""
+
+    angle_deg: float = 0.5
+    offset_mm: float = 1.0
+
+
+def point_sigmas(
+    carms: Sequence[CArm], points_mm: Points, sigma_px: float = 1.0
+) -> tuple[Array, Array]:
+    """Cramer-Rao standard deviations of free points.
+
+    Parameters
+    ----------
+    carms : views
+    points_mm : (n, 3) mm LPS
+    sigma_px : float, noise of (col, row) in every view, pixels
+
+    Returns
+    -------
+    sigma_mm : (n, 3) along the principal axes, smallest first; inf where no view measures
+    axes : (n, 3, 3) rows are the unit axes that belong to them
+    """
+    J = np.concatenate([carm.jacobian(points_mm) for carm in carms], axis=1)
+    _, singular, axes = np.linalg.svd(J, full_matrices=False)
+    with np.errstate(divide="ignore"):
+        sigma = np.where(singular > RELATIVE_CUTOFF * singular[:, :1], sigma_px / singular, np.inf)
+    return sigma, axes
+
+
+def curve_sigmas(
+    carms: Sequence[CArm], points_mm: Points, tangents: Points, sigma_px: float = 1.0
+) -> Scalars:
+    """Worst standard deviation across a vessel, where along it nothing is measured.
+
+    A view measures only the component m = unit(d x T) of a displacement; sliding along the
+    vessel leaves the picture as it is.
+
+    Parameters
+    ----------
+    points_mm, tangents : (n, 3) mm LPS, unit vectors
+
+    Returns
+    -------
+    (n,) mm; inf where at most one view measures
+    """
+    information = np.zeros((len(points_mm), 3, 3))
+    for carm in carms:
+        rays = points_mm - carm.source_mm
+        depth = np.linalg.norm(rays, axis=1)
+        across = np.cross(rays / depth[:, None], tangents)
+        sine = np.linalg.norm(across, axis=1)
+        seen = sine > math.sin(math.radians(ALONG_BEAM_DEG))
+        m = across / np.maximum(sine, 1e-12)[:, None]
+        mm_per_px = depth / math.sqrt(math.prod(carm.focal_px))
+        weight = seen / (sigma_px * mm_per_px) ** 2
+        information += weight[:, None, None] * m[:, :, None] * m[:, None, :]
+    # Only the plane across the vessel counts: along T the information is nil by construction.
+    values = np.linalg.eigvalsh(information)
+    low, high = values[:, 1], values[:, 2]
+    with np.errstate(divide="ignore"):
+        return np.where(
+            low > RELATIVE_CUTOFF * high, 1.0 / np.sqrt(np.maximum(low, 1e-300)), np.inf
+        )
+
+
+def classes(sigma_mm: Scalars, noise_mm: float) -> Array:
+    """(n,) Observability of standard deviations against the noise at the isocentre."""
+    ratio = np.asarray(sigma_mm) / noise_mm
+    return np.where(ratio < WEAK, 0, np.where(ratio <= NONE, 1, 2)).astype(np.int64)
+
+
+def geometry_sigmas(
+    carms: Sequence[CArm], points_mm: Points, prior: GeometryPrior | None = None
+) -> Scalars:
+    """Propagate errors of the geometry itself to triangulated points.
+
+    Each view but the first is turned and moved by one standard deviation in turn; the shift of
+    the triangulated point by finite differences adds up in squares.
+
+    Returns
+    -------
+    (n,) mm, root sum of squares over all parameters and axes
+    """
+    prior = prior or GeometryPrior()
+    total = np.zeros(len(points_mm))
+    steps = [
+        (prior.angle_deg, lambda c, s: c.turned(primary_deg=s)),
+        (prior.angle_deg, lambda c, s: c.turned(secondary_deg=s)),
+        *[
+            (prior.offset_mm, lambda c, s, k=k: c.moved(np.eye(3)[k] * s))
+            for k in range(3)
+        ],
+    ]
+    for k in range(1, len(carms)):
+        for size, change in steps:
+            moved = list(carms)
+            moved[k] = change(carms[k], 0.1 * size)
+            shift = _triangulation_shift(carms, moved, points_mm) / 0.1
+            total += np.sum(shift**2, axis=1)
+    return np.sqrt(total)
+
+
+def _triangulation_shift(told: Sequence[CArm], true: Sequence[CArm], points_mm: Points) -> Points:
+    """(n, 3) linearised error of points seen by ``true`` and triangulated with ``told``."""
+    J = np.concatenate([carm.jacobian(points_mm) for carm in told], axis=1)
+    change = np.concatenate(
+        [
+            b.project(points_mm)[0] - a.project(points_mm)[0]
+            for a, b in zip(told, true, strict=True)
+        ],
+        axis=1,
+    )
+    return np.einsum("nij,nj->ni", np.linalg.pinv(J, rcond=RELATIVE_CUTOFF), change)
+
+
+def rmse_two_views(theta_deg: float, noise_mm: float = 1.0) -> float:
+    """Return s sqrt(1/2 + 2 / sin^2 theta), the bound for two parallel beams at ``theta_deg``."""
+    sine = math.sin(math.radians(theta_deg))
+    return noise_mm * math.sqrt(0.5 + 2.0 / sine**2) if abs(sine) > 1e-12 else math.inf
+
+
+def silent_errors(carms: Sequence[CArm]) -> tuple[str, ...]:
+    """Say what no pair of pictures can show, with what it does to points 50 mm from the centre.
+
+    Returns
+    -------
+    sentences, each with the error in the geometry, its effect in mm, and that it leaves no trace
+    """
+    corners = 50.0 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    angle = max(
+        (
+            min(s, 180 - s)
+            for i, a in enumerate(carms)
+            for b in carms[:i]
+            for s in (separation_deg(a, b),)
+        ),
+        default=0.0,
+    )
+    out = []
+    changes = [
+        ("1 deg in the primary angle of the last view", [*carms[:-1], carms[-1].turned(1.0)]),
+        (
+            "a patient 5 mm off between the runs, within the plane of the beams",
+            [*carms[:-1], carms[-1].moved(_in_plane(carms) * 5.0)],
+        ),
+    ]
+    for name, true in changes:
+        shift = _triangulation_shift(carms, true, corners)
+        effect = math.sqrt(float(np.mean(np.sum(shift**2, axis=1))))
+        out.append(
+            f"{name} moves points by {effect:.1f} mm at {angle:.0f} deg, unseen in the pictures"
+        )
+    return tuple(out)
+
+
+def _in_plane(carms: Sequence[CArm]) -> Array:
+    """Return the unit vector in the plane of the first and last beam, across the last."""
+    d0, d1 = carms[0].axes[2], carms[-1].axes[2]
+    across = d0 - (d0 @ d1) * d1
+    length = float(np.linalg.norm(across))
+    return across / length if length > 1e-9 else np.zeros(3)

@@ -1,0 +1,407 @@
+"""The scene file ``geom.json`` (schema gcar-geometry/1) to views and back.
+
+Parsing is strict: 64 KiB of UTF-8, no NaN or Infinity, no duplicate or unknown keys, no booleans
+for numbers. Every refusal is one line that names the file, the view, the key and the value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.carm import CLINICAL_RANGES, CArm
+from gcar_deploy.geometry.grid import Grid
+
+SCHEMA = "gcar-geometry/1"
+MAX_BYTES = 64 * 1024
+MIN_VIEWS, MAX_VIEWS = 2, 16
+KINDS = ("path_length", "attenuation", "raw")
+POLARITIES = ("auto", "dark", "bright")
+#: the default volume: voxels along each edge
+DEFAULT_SHAPE = 128
+#: the default volume never grows beyond this edge: the heart with its vessels fits, mm
+DEFAULT_EDGE_MM = 180.0
+
+_VIEW_NUMBERS = ("primary_angle_deg", "secondary_angle_deg", "sod_mm", "sdd_mm")
+_REQUIRED = (*_VIEW_NUMBERS, "rows", "columns", "pixel_spacing_mm")
+_OPTIONAL = (
+    "id",
+    "detector_rotation_deg",
+    "principal_point_px",
+    "isocenter_offset_mm",
+    "projection_matrix",
+    "intensity",
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Intensity:
+    """What a count of the picture means.
+
+    Attributes
+    ----------
+    kind : ``path_length``, ``attenuation`` or ``raw``
+    polarity : ``auto``, ``dark`` or ``bright`` (how vessels look)
+    mm_per_count : float or None
+        mm of vessel along the ray per count; needed for ``path_length`` alone.
+    """
+
+    kind: str
+    polarity: str = "auto"
+    mm_per_count: float | None = None
+
+    def __post_init__(self) -> None:
+        _one_of("intensity.kind", self.kind, KINDS)
+        _one_of("intensity.polarity", self.polarity, POLARITIES)
+        scale = self.mm_per_count
+        if scale is not None and not (math.isfinite(scale) and 1e-9 <= scale <= 1e3):
+            raise GeometryError(f"intensity.mm_per_count = {scale!r} is outside 1e-9 .. 1000 mm")
+        if self.kind == "path_length" and scale is None:
+            raise GeometryError("intensity.mm_per_count is missing: kind path_length needs it")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """One view of the scene: a name, its geometry, what its pixels mean."""
+
+    id: str
+    carm: CArm
+    intensity: Intensity
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scene:
+    """All views of one patient at one moment, and the volume that is asked for.
+
+    Attributes
+    ----------
+    views : 2 .. 16 View
+    grid : Grid or None, the ``volume`` of the file
+    warnings : sentences about values that are allowed but unusual
+    """
+
+    views: tuple[View, ...]
+    grid: Grid | None = None
+    warnings: tuple[str, ...] = ()
+
+    def volume_grid(self) -> Grid:
+        """Return the grid asked for, or a cube round the isocentre that all views cover."""
+        return self.grid if self.grid is not None else default_grid([v.carm for v in self.views])
+
+
+def default_grid(carms: list[CArm]) -> Grid:
+    """Cube of 128^3 voxels round the isocentre whose middle sphere every view sees whole."""
+    radius = DEFAULT_EDGE_MM / 2
+    for carm in carms:
+        c0, r0 = carm.principal_point
+        f_col, f_row = carm.focal_px
+        half = min(
+            (min(c0, carm.columns - 1 - c0) + 0.5) / f_col,
+            (min(r0, carm.rows - 1 - r0) + 0.5) / f_row,
+        )
+        if half <= 0:
+            raise GeometryError("principal_point_px lies outside the picture; give a volume")
+        # The cone's edge touches a sphere of SOD sin(half angle) round the isocentre.
+        radius = min(radius, carm.sod_mm * math.sin(math.atan(half)))
+    edge = 2 * radius
+    return Grid(center_mm=(0.0, 0.0, 0.0), size_mm=(edge,) * 3, shape=(DEFAULT_SHAPE,) * 3)
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read and check a scene file.
+
+    Raises
+    ------
+    GeometryError
+        The file is missing, too large, not UTF-8 JSON, or holds a wrong value.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise GeometryError(f"{path.name} is larger than {MAX_BYTES // 1024} KiB")
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError:
+        raise GeometryError(f"{path.name} is not UTF-8 text") from None
+    except OSError as error:
+        raise GeometryError(f"{path.name} cannot be read: {error.strerror}") from None
+    return parse_scene(text, path.name)
+
+
+def parse_scene(text: str, name: str = "geom.json") -> Scene:
+    """Check the text of a scene file; ``name`` is what errors call it."""
+    try:
+        return _scene(_strict_json(text))
+    except GeometryError as error:
+        raise GeometryError(f"{name}: {error}") from None
+
+
+def scene_to_json(scene: Scene) -> str:
+    """Return the scene as the text of a ``geom.json`` that parses to the same scene."""
+    views = []
+    for view in scene.views:
+        c = view.carm
+        entry: dict[str, Any] = {"id": view.id}
+        for key in (*_VIEW_NUMBERS, "detector_rotation_deg", "rows", "columns"):
+            entry[key] = getattr(c, key)
+        entry["pixel_spacing_mm"] = list(c.pixel_spacing_mm)
+        entry["principal_point_px"] = (
+            None if c.principal_point_px is None else list(c.principal_point_px)
+        )
+        entry["isocenter_offset_mm"] = list(c.isocenter_offset_mm)
+        matrix = c.projection_matrix
+        entry["projection_matrix"] = None if matrix is None else [list(row) for row in matrix]
+        entry["intensity"] = dataclasses.asdict(view.intensity)
+        views.append(entry)
+    data: dict[str, Any] = {"schema": SCHEMA, "frame": "LPS", "views": views}
+    if scene.grid is not None:
+        g = scene.grid
+        data["volume"] = {
+            "center_mm": list(g.center_mm),
+            "size_mm": list(g.size_mm),
+            "shape": list(g.shape),
+        }
+    return json.dumps(data, indent=1) + "\n"
+
+
+def match_picture(carm: CArm, rows: int, columns: int) -> tuple[CArm, str | None]:
+    """Fit a view to the size of its picture.
+
+    Returns
+    -------
+    carm : CArm of the picture's own size
+    sentence : None where the sizes agree, else what was rescaled
+
+    Raises
+    ------
+    GeometryError
+        The picture is not an exact rescaling of rows x columns.
+    """
+    if (rows, columns) == (carm.rows, carm.columns):
+        return carm, None
+    if rows * carm.columns != columns * carm.rows:
+        raise GeometryError(
+            f"rows x columns = {carm.rows} x {carm.columns} is at odds with the picture's "
+            f"{rows} x {columns}, which is no exact rescaling"
+        )
+    scale = rows / carm.rows
+    return carm.resized(rows, columns), (
+        f"the picture is {rows} x {columns}, {scale:g} times the {carm.rows} x {carm.columns} of "
+        "the geometry; the pixel spacing was scaled with it"
+    )
+
+
+# -- strict JSON ----------------------------------------------------------------------------
+
+
+def _strict_json(text: str) -> Any:
+    def refuse(token: str) -> Any:
+        raise GeometryError(f"{token} is not a number in JSON")
+
+    def pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for key, value in items:
+            if key in out:
+                raise GeometryError(f"key {key!r} stands twice")
+            out[key] = value
+        return out
+
+    if len(text.encode("utf-8", "replace")) > MAX_BYTES:
+        raise GeometryError(f"larger than {MAX_BYTES // 1024} KiB")
+    try:
+        return json.loads(text, parse_constant=refuse, object_pairs_hook=pairs)
+    except json.JSONDecodeError as error:
+        raise GeometryError(f"not JSON: {error.msg} at line {error.lineno}") from None
+    except RecursionError:
+        raise GeometryError("not a scene: nested too deeply") from None
+    except ValueError:
+        raise GeometryError("a number has too many digits") from None
+
+
+def _scene(data: Any) -> Scene:
+    _object("the file", data, ("schema", "frame", "views", "volume"))
+    if data.get("schema") != SCHEMA:
+        raise GeometryError(f"schema = {data.get('schema')!r} must be {SCHEMA!r}")
+    if data.get("frame", "LPS") != "LPS":
+        raise GeometryError(f"frame = {data['frame']!r} must be 'LPS'")
+    views = data.get("views")
+    if not isinstance(views, list):
+        raise GeometryError("views is missing or not a list")
+    if not MIN_VIEWS <= len(views) <= MAX_VIEWS:
+        raise GeometryError(
+            f"views holds {len(views)} entries, {MIN_VIEWS} .. {MAX_VIEWS} are needed"
+        )
+    parsed: list[View] = []
+    for k, entry in enumerate(views):
+        try:
+            parsed.append(_view(entry, k))
+        except GeometryError as error:
+            raise GeometryError(f"view {k + 1}: {error}") from None
+        if parsed[-1].id in [v.id for v in parsed[:-1]]:
+            raise GeometryError(f"view {k + 1}: id {parsed[-1].id!r} stands twice")
+    volume = data.get("volume")
+    grid = None if volume is None else _grid(volume)
+    scene = Scene(views=tuple(parsed), grid=grid, warnings=tuple(_warnings(parsed)))
+    _check_placing(scene)
+    return scene
+
+
+def _view(entry: Any, k: int) -> View:
+    _object("the view", entry, (*_REQUIRED, *_OPTIONAL))
+    name = entry.get("id", str(k + 1))
+    if not isinstance(name, str) or not 1 <= len(name) <= 64 or not name.isprintable():
+        raise GeometryError(f"id = {name!r} must be text of 1 .. 64 characters")
+    intensity = _intensity(entry.get("intensity"))
+    matrix = entry.get("projection_matrix")
+    if matrix is not None:
+        _number_rows(matrix)
+    alone = matrix is not None and not any(key in entry for key in _VIEW_NUMBERS)
+    needed = ("rows", "columns") if alone else _REQUIRED
+    for key in needed:
+        if entry.get(key) is None:
+            raise GeometryError(f"{key} is missing")
+    rows, columns = _whole("rows", entry["rows"]), _whole("columns", entry["columns"])
+    if alone:
+        carm = CArm.from_matrix(matrix, rows=rows, columns=columns)
+        return View(id=name, carm=carm, intensity=intensity)
+    spacing = _numbers("pixel_spacing_mm", entry["pixel_spacing_mm"], 2)
+    point = entry.get("principal_point_px")
+    offset = entry.get("isocenter_offset_mm")
+    moved = (0.0, 0.0, 0.0) if offset is None else _numbers("isocenter_offset_mm", offset, 3)
+    if any(abs(x) > 500 for x in moved):
+        raise GeometryError(f"isocenter_offset_mm = {list(moved)} is outside -500 .. 500 mm")
+    rotation = entry.get("detector_rotation_deg")
+    carm = CArm(
+        **{key: _number(key, entry[key]) for key in _VIEW_NUMBERS},
+        rows=rows,
+        columns=columns,
+        pixel_spacing_mm=(spacing[0], spacing[1]),
+        detector_rotation_deg=0.0
+        if rotation is None
+        else _number("detector_rotation_deg", rotation),
+        principal_point_px=None
+        if point is None
+        else _pair(_numbers("principal_point_px", point, 2)),
+        isocenter_offset_mm=(moved[0], moved[1], moved[2]),
+        projection_matrix=None if matrix is None else tuple(tuple(map(float, r)) for r in matrix),
+    )
+    return View(id=name, carm=carm, intensity=intensity)
+
+
+def _intensity(entry: Any) -> Intensity:
+    if entry is None:
+        return Intensity(kind="raw")
+    _object("intensity", entry, ("kind", "polarity", "mm_per_count"))
+    scale = entry.get("mm_per_count")
+    return Intensity(
+        kind=entry.get("kind", "raw"),
+        polarity=entry.get("polarity", "auto"),
+        mm_per_count=None if scale is None else _number("intensity.mm_per_count", scale),
+    )
+
+
+def _grid(entry: Any) -> Grid:
+    _object("volume", entry, ("center_mm", "size_mm", "shape"))
+    for key in ("size_mm", "shape"):
+        if entry.get(key) is None:
+            raise GeometryError(f"volume.{key} is missing")
+    center = _numbers("volume.center_mm", entry.get("center_mm", [0, 0, 0]), 3)
+    size = _numbers("volume.size_mm", entry["size_mm"], 3)
+    shape = entry["shape"]
+    if not isinstance(shape, list) or len(shape) != 3:
+        raise GeometryError(f"volume.shape = {shape!r} must be 3 whole numbers")
+    nx, ny, nz = (_whole("volume.shape", n) for n in shape)
+    return Grid(
+        center_mm=(center[0], center[1], center[2]),
+        size_mm=(size[0], size[1], size[2]),
+        shape=(nx, ny, nz),
+    )
+
+
+def _check_placing(scene: Scene) -> None:
+    """Refuse a volume that is not between source and detector: projections mean nothing there."""
+    grid = scene.volume_grid()
+    corners = grid.corners_mm()
+    for view in scene.views:
+        depth = view.carm.project(corners)[1]
+        if depth.min() < 50.0:
+            raise GeometryError(
+                f"view {view.id}: volume reaches to {depth.min():.0f} mm from the source; "
+                "50 mm at least are needed (sod_mm too small or volume.size_mm too large)"
+            )
+        if view.carm.projection_matrix is None and depth.max() > view.carm.sdd_mm:
+            raise GeometryError(
+                f"view {view.id}: volume reaches {depth.max() - view.carm.sdd_mm:.0f} mm behind "
+                "the detector (sdd_mm too small or volume.size_mm too large)"
+            )
+
+
+def _warnings(views: list[View]) -> list[str]:
+    out = []
+    for view in views:
+        for key, (low, high, unit) in CLINICAL_RANGES.items():
+            value = getattr(view.carm, key)
+            if not low <= value <= high:
+                out.append(
+                    f"view {view.id}: {key} = {value:g} {unit} is outside the usual "
+                    f"{low:g} .. {high:g} {unit}"
+                )
+    return out
+
+
+# -- small checks ---------------------------------------------------------------------------
+
+
+def _object(what: str, value: Any, known: tuple[str, ...]) -> None:
+    if not isinstance(value, dict):
+        raise GeometryError(f"{what} must be a JSON object")
+    for key in value:
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known)}"
+            raise GeometryError(f"unknown key {key[:60]!r}{hint}")
+
+
+def _number(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise GeometryError(f"{key} = {value!r} must be a number"[:200])
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise GeometryError(f"{key} is not a finite number")
+    return number
+
+
+def _whole(key: str, value: Any) -> int:
+    number = _number(key, value)
+    if number != int(number):
+        raise GeometryError(f"{key} = {value!r} must be a whole number")
+    return int(number)
+
+
+def _numbers(key: str, value: Any, count: int) -> list[float]:
+    if not isinstance(value, list) or len(value) != count:
+        raise GeometryError(f"{key} = {value!r} must be {count} numbers"[:200])
+    return [_number(key, x) for x in value]
+
+
+def _number_rows(matrix: Any) -> None:
+    if not isinstance(matrix, list) or len(matrix) != 3:
+        raise GeometryError("projection_matrix must be 3 rows of 4 numbers")
+    for row in matrix:
+        _numbers("projection_matrix row", row, 4)
+
+
+def _pair(values: list[float]) -> tuple[float, float]:
+    return values[0], values[1]
+
+
+def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise GeometryError(f"{key} = {value!r} must be one of {', '.join(allowed)}")

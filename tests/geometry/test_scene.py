@@ -1,0 +1,206 @@
+"""Every way a scene file can be wrong has its own line; what is right survives a round trip."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+
+from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.scene import (
+    Intensity,
+    load_scene,
+    match_picture,
+    parse_scene,
+    scene_to_json,
+)
+
+VIEW = {
+    "primary_angle_deg": -30,
+    "secondary_angle_deg": -20,
+    "sod_mm": 765,
+    "sdd_mm": 1100,
+    "rows": 512,
+    "columns": 512,
+    "pixel_spacing_mm": [0.39, 0.39],
+    "intensity": {"kind": "raw", "polarity": "dark"},
+}
+SCENE = {
+    "schema": "gcar-geometry/1",
+    "frame": "LPS",
+    "views": [VIEW, {**VIEW, "primary_angle_deg": 45, "secondary_angle_deg": 25}],
+    "volume": {"center_mm": [0, 0, 0], "size_mm": [128, 128, 128], "shape": [128, 128, 128]},
+}
+
+
+def changed(path, value):
+    data = copy.deepcopy(SCENE)
+    at = data
+    for key in path[:-1]:
+        at = at[key]
+    if value is KeyError:
+        del at[path[-1]]
+    else:
+        at[path[-1]] = value
+    return data
+
+
+FIRST = ("views", 0)
+BAD = [
+    (changed(("schema",), "gcar-geometry/2"), "schema"),
+    (changed(("schema",), KeyError), "schema"),
+    (changed(("frame",), "RAS"), "frame"),
+    (changed(("views",), KeyError), "views is missing"),
+    (changed(("views",), [VIEW]), "views holds 1"),
+    (changed(("views",), [VIEW] * 17), "views holds 17"),
+    (changed(("views",), {}), "views is missing or not a list"),
+    (changed((*FIRST,), 7), "view 1: the view must be a JSON object"),
+    (changed(("volme",), {}), "did you mean 'volume'"),
+    (changed((*FIRST, "sod"), 765), "did you mean 'sod_mm'"),
+    (changed((*FIRST, "primary_angle"), 3), "did you mean 'primary_angle_deg'"),
+    *[
+        (changed((*FIRST, key), KeyError), f"view 1: {key} is missing")
+        for key in (
+            "primary_angle_deg",
+            "secondary_angle_deg",
+            "sod_mm",
+            "sdd_mm",
+            "rows",
+            "columns",
+            "pixel_spacing_mm",
+        )
+    ],
+    (changed((*FIRST, "primary_angle_deg"), 181), "outside -180 .. 180 deg"),
+    (changed((*FIRST, "primary_angle_deg"), "30"), "must be a number"),
+    (changed((*FIRST, "primary_angle_deg"), True), "must be a number"),
+    (changed((*FIRST, "secondary_angle_deg"), -91), "outside -90 .. 90 deg"),
+    (changed((*FIRST, "sod_mm"), 76.5), "sod_mm = 76.5 mm is outside 300 .. 5000 mm"),
+    (changed((*FIRST, "sod_mm"), 0), "outside 300"),
+    (changed((*FIRST, "sod_mm"), 1200), "must exceed sod_mm"),
+    (changed((*FIRST, "sdd_mm"), 11000), "outside 300 .. 8000"),
+    (changed((*FIRST, "rows"), 512.5), "whole number"),
+    (changed((*FIRST, "rows"), -4), "outside 1"),
+    (changed((*FIRST, "pixel_spacing_mm"), 0.39), "must be 2 numbers"),
+    (changed((*FIRST, "pixel_spacing_mm"), [0.39, 0.01]), "outside 0.02 .. 10 mm"),
+    (changed((*FIRST, "pixel_spacing_mm"), [0.39, None]), "must be a number"),
+    (changed((*FIRST, "principal_point_px"), [1, 2, 3]), "must be 2 numbers"),
+    (changed((*FIRST, "isocenter_offset_mm"), [0, 0, 900]), "outside -500 .. 500 mm"),
+    (changed((*FIRST, "projection_matrix"), [[1, 2], [3, 4]]), "3 rows of 4"),
+    (changed((*FIRST, "projection_matrix"), [[0] * 4] * 3), "singular"),
+    (changed((*FIRST, "intensity"), {"kind": "xray"}), "intensity.kind"),
+    (changed((*FIRST, "intensity"), {"kind": "raw", "polarity": "black"}), "intensity.polarity"),
+    (changed((*FIRST, "intensity"), {"kind": "path_length"}), "mm_per_count is missing"),
+    (changed((*FIRST, "intensity"), {"kind": "path_length", "mm_per_count": -1}), "mm_per_count"),
+    (changed((*FIRST, "intensity"), {"kin": "raw"}), "did you mean 'kind'"),
+    (changed((*FIRST, "id"), ""), "id = ''"),
+    (changed((*FIRST, "id"), "2"), "stands twice"),
+    (changed(("volume", "shape"), [128, 128]), "volume.shape"),
+    (changed(("volume", "shape"), [128, 128, 0]), "outside 1 .. 1024"),
+    (changed(("volume", "size_mm"), [128, 128, -1]), "volume.size_mm"),
+    (changed(("volume", "size_mm"), KeyError), "volume.size_mm is missing"),
+    (changed(("volume", "center_mm"), [0, 800, 0]), "from the source"),
+    (changed(("volume", "size_mm"), [128, 900, 128]), "behind the detector"),
+]
+
+
+@pytest.mark.parametrize(("data", "message"), BAD, ids=range(len(BAD)))
+def test_bad_scene_is_one_line_that_says_where(data, message):
+    with pytest.raises(GeometryError) as caught:
+        parse_scene(json.dumps(data), "g.json")
+    text = str(caught.value)
+    assert message in text and text.startswith("g.json: ") and "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not JSON"),
+        ("{", "not JSON"),
+        ("[1, 2]", "must be a JSON object"),
+        ('{"schema": NaN}', "NaN is not a number"),
+        ('{"schema": 1, "schema": 2}', "stands twice"),
+        ("[" * 40000, "deep"),
+        ('{"a": ' + "9" * 5000 + "}", "digits"),
+        (" " * 70000, "64 KiB"),
+        (json.dumps(SCENE).replace("765", "1e999", 1), "not a finite number"),
+    ],
+)
+def test_bad_json(text, message):
+    with pytest.raises(GeometryError, match=message):
+        parse_scene(text)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(GeometryError, match=r"none\.json cannot be read"):
+        load_scene(tmp_path / "none.json")
+    (tmp_path / "utf16.json").write_text(json.dumps(SCENE), encoding="utf-16")
+    with pytest.raises(GeometryError, match="UTF-8"):
+        load_scene(tmp_path / "utf16.json")
+
+
+def test_round_trip_and_defaults():
+    scene = parse_scene(json.dumps(SCENE))
+    assert parse_scene(scene_to_json(scene)) == scene
+    assert [v.id for v in scene.views] == ["1", "2"]
+    assert scene.warnings == ()
+    bare = parse_scene(json.dumps(changed(("volume",), KeyError)))
+    grid = bare.volume_grid()
+    assert grid.shape == (128, 128, 128)
+    # A sphere that touches the default cube's faces is seen whole by every view.
+    rng = np.random.default_rng(0)
+    p = rng.normal(size=(2000, 3))
+    p *= 0.5 * grid.size_mm[0] / np.linalg.norm(p, axis=1, keepdims=True)
+    for view in bare.views:
+        pixels, _ = view.carm.project(p)
+        assert pixels.min() > -1.5 and pixels.max() < 512.5
+
+
+def test_unusual_values_are_warned_about():
+    scene = parse_scene(json.dumps(changed((*FIRST, "sod_mm"), 500)))
+    assert scene.warnings == ("view 1: sod_mm = 500 mm is outside the usual 600 .. 900 mm",)
+
+
+def test_matrix_alone_is_enough():
+    carm = parse_scene(json.dumps(SCENE)).views[0].carm
+    data = changed(
+        FIRST, {"rows": 512, "columns": 512, "projection_matrix": carm.world2pixel.tolist()}
+    )
+    other = parse_scene(json.dumps(data)).views[0]
+    X = np.array([[10.0, 20, -30]])
+    np.testing.assert_allclose(other.carm.project(X)[0], carm.project(X)[0], atol=1e-6)
+    assert other.intensity == Intensity(kind="raw")
+
+
+def test_picture_of_another_size():
+    carm = CArm(
+        **{k: v for k, v in VIEW.items() if k not in ("intensity", "pixel_spacing_mm")},
+        pixel_spacing_mm=(0.39, 0.39),
+    )
+    same, said = match_picture(carm, 512, 512)
+    assert same is carm and said is None
+    half, said = match_picture(carm, 256, 256)
+    assert half.rows == 256 and "0.5 times" in said
+    with pytest.raises(GeometryError, match="at odds"):
+        match_picture(carm, 256, 512)
+
+
+def test_schema_file_says_the_same():
+    jsonschema = pytest.importorskip("jsonschema")
+    from importlib import resources
+
+    schema = json.loads(
+        (resources.files("gcar_deploy") / "geometry/geometry.schema.json").read_text()
+    )
+    validator = jsonschema.Draft202012Validator(schema)
+    validator.validate(SCENE)
+    checked = [
+        d
+        for d, m in BAD
+        if not any(
+            w in m
+            for w in ("exceed", "twice", "source", "behind", "singular", "mm_per_count is missing")
+        )
+    ]
+    missed = [d for d in checked if validator.is_valid(d)]
+    assert not missed
