@@ -1,0 +1,1 @@
+"""Workshop: simulate, train, export, evaluate. Imports the runtime, never the reverse."""

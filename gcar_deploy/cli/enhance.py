@@ -1,0 +1,81 @@
+"""gcar enhance PICTURE --out DIR: look at each step of finding the vessels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command("enhance")
+@click.argument("picture", type=click.Path(path_type=Path))
+@click.option(
+    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
+)
+@click.option(
+    "--kind",
+    type=click.Choice(["raw", "attenuation", "path_length"]),
+    default="raw",
+    show_default=True,
+    help="What a grey value means.",
+)
+@click.option(
+    "--polarity",
+    type=click.Choice(["auto", "dark", "bright"]),
+    default="auto",
+    show_default=True,
+    help="Whether vessels are darker or brighter than what surrounds them.",
+)
+@click.option(
+    "--pixel-mm",
+    type=click.FloatRange(0.01, 10),
+    default=None,
+    help="Pixel size at the isocentre (detector spacing x SOD / SDD); by default the longer "
+    "side of the picture is taken as 150 mm.",
+)
+@click.option(
+    "--mm-per-count",
+    type=click.FloatRange(0, min_open=True),
+    default=None,
+    help="For --kind path_length: millimetres of vessel per count.",
+)
+@click.option("--force", is_flag=True, help="Replace an existing folder.")
+def enhance(
+    picture: Path,
+    out_dir: Path,
+    kind: str,
+    polarity: str,
+    pixel_mm: float | None,
+    mm_per_count: float | None,
+    force: bool,
+) -> None:
+    r"""Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
+
+    \b
+    Example:
+      gcar enhance view1.png --out steps
+    """
+    from gcar_deploy.config import ImagingOptions
+    from gcar_deploy.errors import UsageError
+    from gcar_deploy.geometry.scene import Intensity
+    from gcar_deploy.imaging.angiogram import Angiogram
+    from gcar_deploy.imaging.extract import extract_vessels
+    from gcar_deploy.imaging.pictures import vessel_pictures, write_folder
+    from gcar_deploy.imaging.read import read_picture
+
+    if out_dir.exists() and not force:
+        raise UsageError(f"{out_dir} exists; choose another folder or add --force")
+    if kind == "path_length" and mm_per_count is None:
+        raise UsageError("--kind path_length needs --mm-per-count")
+    options = ImagingOptions()
+    intensity = Intensity(kind=kind, polarity=polarity, mm_per_count=mm_per_count)
+    angiogram = Angiogram.without_geometry(
+        picture.stem, read_picture(picture, options.limits), intensity, pixel_mm
+    )
+    found = extract_vessels(angiogram, options)
+    write_folder(out_dir, vessel_pictures(found), force=force)
+    length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
+    click.echo(
+        f"{out_dir}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "
+        f"skeleton.png (about {length_mm:.0f} mm)"
+    )

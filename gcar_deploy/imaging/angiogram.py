@@ -1,0 +1,126 @@
+"""Angiogram and VesselImage: pixels that never travel without their C-arm."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from gcar_deploy.errors import ImageError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.types import Image, Mask
+
+if TYPE_CHECKING:  # only a name in annotations: pictures need no scene file
+    from gcar_deploy.geometry.scene import Intensity
+
+#: longer side of the field at the isocentre where nothing is known of a picture, mm
+DEFAULT_FIELD_MM = 150.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Angiogram:
+    """One picture as it was read, with the view that took it.
+
+    Attributes
+    ----------
+    view_id : str
+        Name of the view in the scene.
+    carm : CArm
+        The view; its rows and columns are those of ``pixels``.
+    pixels : (rows, cols) float32
+        Grey values in counts, finite.
+    bit_depth : int
+        Of the file: 8 or 16, 32 or 64 for floating-point arrays.
+    intensity : Intensity
+        What a count means.
+    sha256 : str
+        Of the bytes of the file.
+    """
+
+    view_id: str
+    carm: CArm
+    pixels: Image
+    bit_depth: int
+    intensity: Intensity
+    sha256: str
+
+    def __post_init__(self) -> None:
+        _check_shape(self.view_id, self.carm, self.pixels)
+
+    @classmethod
+    def without_geometry(
+        cls,
+        view_id: str,
+        picture: tuple[Image, int, str],
+        intensity: Intensity,
+        pixel_mm: float | None = None,
+    ) -> Angiogram:
+        """Wrap what ``read_picture`` gave for looking at one picture alone.
+
+        The view is frontal; ``pixel_mm`` is the pixel size at the isocentre, by default that
+        of a field of ``DEFAULT_FIELD_MM``.
+        """
+        pixels, bit_depth, sha256 = picture
+        rows, columns = pixels.shape
+        at_detector = (pixel_mm or DEFAULT_FIELD_MM / max(rows, columns)) * 4 / 3
+        carm = CArm(
+            primary_angle_deg=0.0,
+            secondary_angle_deg=0.0,
+            sod_mm=750.0,
+            sdd_mm=1000.0,
+            rows=rows,
+            columns=columns,
+            pixel_spacing_mm=(at_detector, at_detector),
+        )
+        return cls(
+            view_id=view_id,
+            carm=carm,
+            pixels=pixels,
+            bit_depth=bit_depth,
+            intensity=intensity,
+            sha256=sha256,
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class VesselImage:
+    """What is vessel in one view, and how much of it each ray crosses.
+
+    Attributes
+    ----------
+    view_id : str
+    carm : CArm
+        Its rows and columns are those of the arrays.
+    path_mm : (rows, cols) float32
+        Millimetres of vessel along the ray of each pixel (mean over the pixel), 0 outside
+        ``mask``. An estimate unless ``calibrated``.
+    calibrated : bool
+        True only for ``path_length`` pictures, whose scale was given.
+    mask, skeleton, valid : (rows, cols) bool
+        Vessel; its one-pixel-wide centreline; pixels that carry a picture (no collimator).
+    kind : str
+        ``path_length``, ``attenuation`` or ``raw``.
+    vesselness : (rows, cols) float32 or None
+        Ridge response; None where the picture needed no enhancement.
+    """
+
+    view_id: str
+    carm: CArm
+    path_mm: Image
+    calibrated: bool
+    mask: Mask
+    skeleton: Mask
+    valid: Mask
+    kind: str
+    vesselness: Image | None = None
+
+    def __post_init__(self) -> None:
+        for array in (self.path_mm, self.mask, self.skeleton, self.valid):
+            _check_shape(self.view_id, self.carm, array)
+
+
+def _check_shape(view_id: str, carm: CArm, array: Image | Mask) -> None:
+    if array.shape != (carm.rows, carm.columns):
+        raise ImageError(
+            f"view {view_id}: the picture has {array.shape} (rows, columns), the geometry says "
+            f"{(carm.rows, carm.columns)}"
+        )

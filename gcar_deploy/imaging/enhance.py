@@ -1,0 +1,199 @@
+"""From grey values to ridge response: logarithm, collimator, flattening, vesselness."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.types import Array, Image, Mask
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Ridges:
+    """Multi-scale response to bright lines.
+
+    Attributes
+    ----------
+    response : (rows, cols) float32, in units of the picture, times sigma^power
+    sigma_px : (rows, cols) float32, Gaussian width at which the response was largest
+    """
+
+    response: Image
+    sigma_px: Image
+
+
+def absorbance(pixels: Image, offset: float) -> Image:
+    """(rows, cols) -log(grey / white + offset): what absorbs more is brighter.
+
+    White is the 99.5th percentile. The offset keeps black finite and halves the gain where a
+    display curve has squeezed the dark end; it is a compromise between a linear detector and
+    a picture whose logarithm was already taken.
+    """
+    white = max(float(np.percentile(pixels, 99.5)), 1e-12)
+    return -np.log(np.clip(pixels, 0, None) / white + offset, dtype=np.float32)
+
+
+def collimator(pixels: Image) -> Mask:
+    """(rows, cols) bool: dark, even areas that reach the border, wider than any vessel."""
+    rows, columns = pixels.shape
+    side = min(rows, columns)
+    smooth = cv2.GaussianBlur(pixels, (0, 0), max(1.0, side / 150))
+    middle, low = float(np.median(smooth)), float(np.percentile(smooth, 0.1))
+    dark = (smooth < low + 0.25 * (middle - low)).astype(np.uint8)
+    reach = round(side * 0.05) | 1
+    # Continue the picture outwards, or the opening would eat the corners.
+    padded = cv2.copyMakeBorder(dark, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, disc)[reach:-reach, reach:-reach]
+    _, label, stats, _ = cv2.connectedComponentsWithStats(opened)
+    x, y, wide, high, area = stats.T
+    at_border = (x == 0) | (y == 0) | (x + wide == columns) | (y + high == rows)
+    chosen = at_border & (area > 0.004 * rows * columns)
+    chosen[0] = False
+    for i in np.flatnonzero(chosen):
+        chosen[i] = _step(smooth, label == i, reach) > 0.35 * (middle - low)
+    found = chosen[label]
+    if found.mean() > 0.6:  # a dark picture, not a border
+        return np.zeros_like(found)
+    grow = max(3, round(side * 0.03)) | 1
+    return cv2.dilate(found.astype(np.uint8), np.ones((grow, grow), np.uint8)) > 0
+
+
+def _step(smooth: Array, area: Mask, reach: int) -> float:
+    """Rise of the grey value across the rim of ``area``: a shutter is sharp, a shadow is not."""
+    inside = cv2.copyMakeBorder(area.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    outward = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    inward = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    rings = [(d > 0.2 * reach) & (d < 0.7 * reach) for d in (outward, inward)]
+    if not (rings[0].any() and rings[1].any()):
+        return 0.0
+    return float(np.median(smooth[rings[0]]) - np.median(smooth[rings[1]]))
+
+
+def fill_holes(picture: Image, holes: Mask) -> Image:
+    """Give each pixel of ``holes`` the value of the nearest pixel outside."""
+    if not holes.any() or holes.all():
+        return picture
+    _, label = cv2.distanceTransformWithLabels(
+        holes.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(label.max()) + 1, picture.dtype)
+    table[label[~holes]] = picture[~holes]
+    return np.where(holes, table[label], picture)
+
+
+def flatten(picture: Image, sigma_px: float) -> Image:
+    """Take away what varies more slowly than a Gaussian of ``sigma_px``."""
+    return picture - _wide_blur(picture, sigma_px)
+
+
+def _wide_blur(picture: Image, sigma_px: float) -> Image:
+    factor = max(1, int(sigma_px // 4))
+    if factor == 1:
+        near = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(near, dtype=np.float32)
+    rows, columns = picture.shape
+    size = (max(1, columns // factor), max(1, rows // factor))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma_px / factor, borderType=cv2.BORDER_REPLICATE)
+    small = cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(small, dtype=np.float32)
+
+
+def background(picture: Image, vessel: Mask, margin_px: float, sigma_px: float) -> Image:
+    """Fill the vessels in from their surroundings by normalised convolution.
+
+    Parameters
+    ----------
+    picture : (rows, cols) float32
+    vessel : (rows, cols) bool
+    margin_px : float, left out round the vessels
+    sigma_px : float, width of the fill; a far wider one takes over where nothing is near
+    """
+    reach = 2 * max(1, round(margin_px)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    weight = 1.0 - cv2.dilate(vessel.astype(np.uint8), disc).astype(np.float32)
+    near, near_weight = _blurred_pair(picture, weight, sigma_px)
+    far, far_weight = _blurred_pair(picture, weight, 4 * sigma_px)
+    trust = np.float32(0.01)
+    total = near + trust * far / np.maximum(far_weight, np.float32(1e-6))
+    return np.asarray(total / (near_weight + trust), dtype=np.float32)
+
+
+def _blurred_pair(picture: Image, weight: Image, sigma_px: float) -> tuple[Image, Image]:
+    return _wide_blur(picture * weight, sigma_px), _wide_blur(weight, sigma_px)
+
+
+def ridge_response(picture: Image, sigma_px: float, gap_sigmas: float) -> Image:
+    """Response of one scale to bright lines.
+
+    Geometric mean of the Hessian's strongest negative curvature, -sigma^2 lambda_1 (Frangi et
+    al. 1998; its peak over sigma is at the line's own width), and of the step down to the
+    *higher* of the two sides, ``gap_sigmas`` sigma away along the normal. An edge has
+    curvature but no second side, a blob in noise little of either.
+
+    Parameters
+    ----------
+    picture : (rows, cols) float32
+    sigma_px : float
+    gap_sigmas : float
+
+    Returns
+    -------
+    (rows, cols) float32, units of the picture, >= 0
+    """
+    smooth = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
+    xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3, scale=0.25)
+    yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3, scale=0.25)
+    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
+    half_gap = np.hypot(0.5 * (xx - yy), xy)
+    strongest = 0.5 * (xx + yy) - half_gap
+    # The normal is the eigenvector of the smaller eigenvalue.
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.float32(np.pi / 2)
+    step = np.float32(gap_sigmas * sigma_px)
+    dx, dy = step * np.cos(angle), step * np.sin(angle)
+    row, column = np.indices(picture.shape, dtype=np.float32)
+    sides = [
+        cv2.remap(
+            smooth, column + s * dx, row + s * dy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        for s in (np.float32(1), np.float32(-1))
+    ]
+    drop = np.clip(smooth - np.maximum(*sides), 0, None)
+    return np.sqrt(drop * np.clip(-strongest, 0, None)) * np.float32(sigma_px)
+
+
+def ridges(picture: Image, pixel_mm: float, options: ImagingOptions) -> Ridges:
+    """Largest response over the scales of ``options``; ``picture`` has bright vessels."""
+    response = np.zeros_like(picture)
+    best = np.ones_like(picture)
+    for sigma in sorted({max(1.0, mm / pixel_mm) for mm in options.ridge_sigma_mm}):
+        # relative to the smallest scale, so that units stay those of the picture
+        weight = (sigma * pixel_mm / options.ridge_sigma_mm[0]) ** options.scale_power
+        one = np.float32(weight) * ridge_response(picture, sigma, options.side_gap_sigmas)
+        larger = one > response
+        response[larger] = one[larger]
+        best[larger] = sigma
+    return Ridges(response=response, sigma_px=best)
+
+
+def vessels_are_dark(pixels: Image, pixel_mm: float, options: ImagingOptions) -> tuple[bool, float]:
+    """Compare the ridges of the picture with those of its negative.
+
+    Returns
+    -------
+    dark : bool
+    margin : float
+        Ratio of the two strengths (99th percentile), >= 1; near 1 means undecided.
+    """
+    holes = collimator(pixels)
+    flat = flatten(fill_holes(pixels, holes), options.flatten_sigma_mm / pixel_mm)
+    strength = []
+    for picture in (-flat, flat):
+        response = ridges(picture, pixel_mm, options).response
+        strength.append(float(np.percentile(response[~holes], 99)) + 1e-12)
+    dark, bright = strength
+    return dark >= bright, max(dark, bright) / min(dark, bright)

@@ -1,0 +1,174 @@
+"""One angiogram to one vessel image, for each kind of picture the contract knows."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.errors import GeometryError, RefusedError
+from gcar_deploy.imaging import calibrate, enhance, segment
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.types import Image, Mask
+
+_log = logging.getLogger(__name__)
+#: polarity is taken from the picture only when one sign answers this much more strongly
+_POLARITY_MARGIN = 1.15
+
+
+def extract_vessels(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+    """Find mask, skeleton and path length of the vessels.
+
+    Parameters
+    ----------
+    angiogram : Angiogram
+        ``path_length``: counts times ``mm_per_count``. ``attenuation``: linear in the path
+        with unknown scale, vessels bright. ``raw``: vessels dark unless the polarity says
+        otherwise or the picture clearly does; contrast against the filled-in background,
+        scaled by the width of the vessels' shadows.
+    options : ImagingOptions
+
+    Returns
+    -------
+    VesselImage
+
+    Raises
+    ------
+    RefusedError
+        No vessel: blank, constant, saturated, or nothing that stands out of the noise.
+    GeometryError
+        ``path_length`` without ``mm_per_count`` or declared dark.
+    """
+    pixels = angiogram.pixels
+    if not float(pixels.max()) > float(pixels.min()):
+        raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")
+    if angiogram.intensity.kind == "path_length":
+        return _from_path_length(angiogram, options)
+    return _from_grey(angiogram, options)
+
+
+def _nothing(angiogram: Angiogram, reason: str) -> RefusedError:
+    return RefusedError(
+        f"no vessel found in view {angiogram.view_id}: {reason}; "
+        "check the picture and its intensity kind and polarity"
+    )
+
+
+def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+    scale = angiogram.intensity.mm_per_count
+    if scale is None:
+        raise GeometryError(
+            f"view {angiogram.view_id}: intensity kind path_length needs mm_per_count "
+            "(millimetres of vessel per count)"
+        )
+    if angiogram.intensity.polarity == "dark":
+        raise GeometryError(
+            f"view {angiogram.view_id}: path_length pictures have bright vessels, "
+            "polarity dark contradicts that; use kind raw or invert the picture"
+        )
+    path = np.asarray(angiogram.pixels * np.float32(scale), dtype=np.float32)
+    smallest = options.path_threshold_pixels * angiogram.carm.pixel_at_isocenter_mm
+    mask = path > smallest
+    if not mask.any():
+        raise _nothing(angiogram, f"no path is longer than {smallest:.2g} mm")
+    if mask.mean() > 0.9:
+        raise _nothing(angiogram, "nearly every pixel is full")
+    return VesselImage(
+        view_id=angiogram.view_id,
+        carm=angiogram.carm,
+        path_mm=np.where(mask, path, np.float32(0)),
+        calibrated=True,
+        mask=mask,
+        skeleton=skel.skeletonize(mask),
+        valid=np.ones_like(mask),
+        kind="path_length",
+    )
+
+
+def _from_grey(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+    pixels, kind = angiogram.pixels, angiogram.intensity.kind
+    pixel_mm = angiogram.carm.pixel_at_isocenter_mm
+    dark = is_dark(angiogram, options)
+    pictures, holes = bright_vessels(pixels, kind, dark, options)
+    search = pictures.get("search", next(iter(pictures.values())))
+    found = segment.segment(search, holes, pixel_mm, options)
+    length = found.skeleton.sum() * pixel_mm
+    too_faint = found.contrast < options.min_contrast or found.peak < options.min_peak
+    if length < options.min_length_mm or too_faint:
+        raise _nothing(
+            angiogram,
+            f"{length:.0f} mm of line, {found.peak:.1%} contrast, {found.contrast:.1f} times the "
+            f"noise (needed: {options.min_length_mm:g} mm, {options.min_peak:.0%}, "
+            f"{options.min_contrast:g} times)",
+        )
+    estimate = calibrate.estimate_path(
+        {name: picture for name, picture in pictures.items() if name != "search"},
+        found,
+        pixel_mm,
+        options.margin_mm / pixel_mm,
+        options.fill_sigma_mm / pixel_mm,
+    )
+    _log.info(
+        "view %s: %s grey values, %.4g mm per unit, contrast/width spread %.2f",
+        angiogram.view_id, estimate.domain, estimate.mm_per_unit, estimate.spread,
+    )  # fmt: skip
+    if estimate.mm_per_unit <= 0:
+        raise _nothing(angiogram, "the lines found have no contrast")
+    return VesselImage(
+        view_id=angiogram.view_id,
+        carm=angiogram.carm,
+        path_mm=estimate.path_mm,
+        calibrated=False,
+        mask=found.mask,
+        skeleton=found.skeleton,
+        valid=found.valid,
+        kind=kind,
+        vesselness=found.vesselness,
+    )
+
+
+def is_dark(angiogram: Angiogram, options: ImagingOptions) -> bool:
+    """Whether vessels are darker than their surroundings: declared, else seen, else usual."""
+    declared = angiogram.intensity.polarity
+    if declared != "auto":
+        return declared == "dark"
+    usual = angiogram.intensity.kind == "raw"
+    seen, margin = enhance.vessels_are_dark(
+        angiogram.pixels, angiogram.carm.pixel_at_isocenter_mm, options
+    )
+    decided = margin >= _POLARITY_MARGIN
+    _log.info(
+        "view %s: vessels taken as %s (%s, strengths differ by a factor %.2f)",
+        angiogram.view_id, "dark" if (seen if decided else usual) else "bright",
+        "seen in the picture" if decided else f"usual for {angiogram.intensity.kind}", margin,
+    )  # fmt: skip
+    return seen if decided else usual
+
+
+def bright_vessels(
+    pixels: Image, kind: str, dark: bool, options: ImagingOptions
+) -> tuple[dict[str, Image], Mask]:
+    """Pictures in which vessels are bright and paths add up, one per grey-value law.
+
+    Returns
+    -------
+    pictures : name -> (rows, cols) float32
+        ``search`` (where given) is the one to look for vessels in; the others are linear in
+        the path if their law holds.
+    holes : (rows, cols) bool, collimator
+    """
+    white = max(float(np.percentile(pixels, 99.5)), 1e-12)
+    level = pixels / np.float32(white)
+    if kind == "attenuation":
+        return {"linear": -level if dark else level}, np.zeros(pixels.shape, bool)
+    holes = enhance.collimator(pixels)
+    if not dark:  # a negative: turn it back, so that Beer's law can be tried on it
+        level = float(level.max()) - level
+    floor = np.float32(0.5 / white)  # half a count: black stays finite
+    return {
+        "search": enhance.absorbance(level, options.log_offset),
+        "linear": -level,
+        "log": -np.log(np.maximum(level, floor)),
+    }, holes

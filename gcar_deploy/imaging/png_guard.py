@@ -1,0 +1,193 @@
+"""What a PNG or TIFF file claims, checked before any decoder sees its bytes.
+
+Decoders allocate what a header asks for; a file of a few hundred bytes can ask for
+gigabytes. Here every length is compared with the bytes that are really there, PNG data are
+inflated against the size that the header promises, and everything that would turn, animate
+or map the grey values is refused. Functions raise ``ValueError`` with the end of a sentence;
+``read`` puts the name of the file in front.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*")
+MAX_CHUNK_BYTES = 16 * 2**20
+_ANIMATION = {b"acTL", b"fcTL", b"fdAT"}
+_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
+_MAX_TIFF_ENTRIES = 256
+_TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
+
+
+def check_sides(rows: int, columns: int, smallest: int, largest: int) -> None:
+    """Refuse a picture whose sides are outside ``smallest`` .. ``largest`` pixels."""
+    if not (smallest <= rows <= largest and smallest <= columns <= largest):
+        raise ValueError(
+            f"is {columns} x {rows} pixels (columns x rows); each side must be "
+            f"{smallest} .. {largest}"
+        )
+
+
+def check_png(data: bytes, smallest: int, largest: int) -> int:
+    """Walk the chunks of a PNG file; return its bit depth.
+
+    Raises
+    ------
+    ValueError
+        Not a PNG, truncated, checksum wrong, animated, palette, transparent, bit depth other
+        than 8 or 16, sides out of range, or data that inflate to another size than promised.
+    """
+    header: tuple[int, int, int, int, int] | None = None
+    pixels = bytearray()
+    ended = False
+    for kind, body in _chunks(data):
+        if header is None:
+            if kind != b"IHDR" or len(body) != 13:
+                raise ValueError("does not begin with a PNG header; export the picture again")
+            header = _png_header(body, smallest, largest)
+        elif kind in _ANIMATION:
+            raise ValueError("is an animated PNG; export one frame as an ordinary PNG")
+        elif kind == b"tRNS":
+            raise ValueError("has transparent pixels; export it without transparency")
+        elif kind == b"IDAT":
+            pixels += body
+        elif kind == b"IEND":
+            ended = True
+            break
+    if header is None or not ended:
+        raise ValueError("is truncated; copy or export it again")
+    _check_inflated(bytes(pixels), *header)
+    return header[2]
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    at = len(PNG_SIGNATURE)
+    while at < len(data):
+        if at + 12 > len(data):
+            raise ValueError("is truncated; copy or export it again")
+        (length,) = struct.unpack_from(">I", data, at)
+        kind = data[at + 4 : at + 8]
+        if length > MAX_CHUNK_BYTES or at + 12 + length > len(data):
+            raise ValueError("is truncated or damaged (a chunk is longer than the file)")
+        body = data[at + 8 : at + 8 + length]
+        (crc,) = struct.unpack_from(">I", data, at + 8 + length)
+        if zlib.crc32(kind + body) != crc:
+            raise ValueError("is damaged (a PNG checksum is wrong); copy it again")
+        yield kind, body
+        at += 12 + length
+
+
+def _png_header(body: bytes, smallest: int, largest: int) -> tuple[int, int, int, int, int]:
+    columns, rows, depth, colour, compression, filtering, interlace = struct.unpack(
+        ">IIBBBBB", body
+    )
+    check_sides(rows, columns, smallest, largest)
+    if colour == 3:
+        raise ValueError("uses a colour palette; export it as 8 or 16 bit grey")
+    if colour not in _CHANNELS or compression or filtering or interlace > 1:
+        raise ValueError("has an invalid PNG header; export it again")
+    if depth not in (8, 16):
+        raise ValueError(f"has {depth} bits per pixel; 8 or 16 bit grey is needed")
+    return rows, columns, depth, colour, interlace
+
+
+def _check_inflated(
+    packed: bytes, rows: int, columns: int, depth: int, colour: int, interlace: int
+) -> None:
+    pixel_bytes = _CHANNELS[colour] * depth // 8
+    if interlace:
+        # Adam7: (first column, first row, column step, row step) of the seven passes.
+        steps: tuple[tuple[int, int, int, int], ...]
+        steps = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4))
+        steps += ((1, 0, 2, 2), (0, 1, 1, 2))
+        expected = 0
+        for x, y, dx, dy in steps:
+            wide, high = -((x - columns) // dx), -((y - rows) // dy)
+            expected += high * (1 + wide * pixel_bytes) if wide > 0 and high > 0 else 0
+    else:
+        expected = rows * (1 + columns * pixel_bytes)
+    inflater = zlib.decompressobj()
+    try:
+        size = len(inflater.decompress(packed, expected + 1))
+    except zlib.error:
+        raise ValueError("is damaged (its data do not inflate); copy it again") from None
+    if size != expected:
+        raise ValueError("is damaged (more or fewer pixels than its header says); copy it again")
+
+
+def check_tiff(data: bytes, smallest: int, largest: int) -> int:
+    """Read the first directory of a TIFF file; return its bit depth.
+
+    Raises
+    ------
+    ValueError
+        Truncated, several pages, turned by an orientation tag, not 8 or 16 bit unsigned, a
+        palette or inverted grey, sides out of range.
+    """
+    order = "<" if data[:2] == b"II" else ">"
+    tags, next_page = _tiff_directory(data, order)
+    if next_page:
+        raise ValueError("holds several pages; export the one frame to be used")
+    rows, columns = _one(tags, 257, 0), _one(tags, 256, 0)
+    check_sides(rows, columns, smallest, largest)
+    depths = set(tags.get(258, (1,)))
+    if len(depths) != 1 or not depths <= {8, 16}:
+        raise ValueError(f"has {sorted(depths)} bits per sample; 8 or 16 bit grey is needed")
+    if set(tags.get(339, (1,))) != {1}:
+        raise ValueError("holds signed or floating-point samples; save such data as NPY")
+    if _one(tags, 262, -1) not in (1, 2):
+        raise ValueError("is not plain grey (black is zero); export it as 8 or 16 bit grey")
+    if _one(tags, 274, 1) != 1:
+        raise ValueError("asks to be turned (orientation tag); export it the right way up")
+    if not 1 <= _one(tags, 277, 1) <= 4:
+        raise ValueError("has an invalid number of channels; export it as 8 or 16 bit grey")
+    _check_tiff_data(data, tags, rows * columns)
+    return depths.pop()
+
+
+def _check_tiff_data(data: bytes, tags: dict[int, tuple[int, ...]], pixels: int) -> None:
+    starts = tags.get(273) or tags.get(324) or ()
+    counts = tags.get(279) or tags.get(325) or ()
+    if not starts or len(starts) != len(counts):
+        raise ValueError("has no picture data; export it again")
+    for start, count in zip(starts, counts, strict=True):
+        if start + count > len(data):
+            raise ValueError("is truncated; copy or export it again")
+    bytes_per_pixel = tags.get(258, (8,))[0] // 8 * _one(tags, 277, 1)
+    if _one(tags, 259, 1) == 1 and sum(counts) < pixels * bytes_per_pixel:
+        raise ValueError("is truncated; copy or export it again")
+
+
+def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int) -> int:
+    values = tags.get(tag, ())
+    return values[0] if values else default
+
+
+def _tiff_directory(data: bytes, order: str) -> tuple[dict[int, tuple[int, ...]], int]:
+    try:
+        (at,) = struct.unpack_from(order + "I", data, 4)
+        (entries,) = struct.unpack_from(order + "H", data, at)
+        if entries > _MAX_TIFF_ENTRIES:
+            raise ValueError("is damaged (too many TIFF tags); export it again")
+        tags = {}
+        for i in range(entries):
+            tag, kind, count = struct.unpack_from(order + "HHI", data, at + 2 + 12 * i)
+            tags[tag] = _tiff_values(data, order, at + 10 + 12 * i, kind, count)
+        (next_page,) = struct.unpack_from(order + "I", data, at + 2 + 12 * entries)
+    except struct.error:
+        raise ValueError("is truncated or damaged; copy or export it again") from None
+    return tags, next_page
+
+
+def _tiff_values(data: bytes, order: str, at: int, kind: int, count: int) -> tuple[int, ...]:
+    if kind not in (1, 3, 4):  # only whole numbers matter here
+        return ()
+    size = _TIFF_SIZES[kind] * count
+    if size > len(data):
+        raise ValueError("is truncated or damaged; copy or export it again")
+    if size > 4:
+        (at,) = struct.unpack_from(order + "I", data, at)
+    return struct.unpack_from(f"{order}{count}{ {1: 'B', 3: 'H', 4: 'I'}[kind] }", data, at)

@@ -1,0 +1,164 @@
+"""Read one picture from disk: PNG, TIFF or NPY, nothing lost, nothing turned, nothing run."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import os
+import stat
+import tokenize
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import PictureLimits
+from gcar_deploy.errors import ImageError
+from gcar_deploy.imaging import png_guard
+from gcar_deploy.types import Array, Image
+
+_log = logging.getLogger(__name__)
+_NPY_SIGNATURE = b"\x93NUMPY"
+#: what else a hostile header can raise
+_HEADER = (MemoryError, RecursionError, OverflowError)
+_NPY_DEPTH = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
+_SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
+
+
+def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple[Image, int, str]:
+    """Read a picture; the file is opened once, only for reading.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.png``, ``.tif``/``.tiff`` (8 or 16 bit grey, or colour with R = G = B and no
+        transparency) or ``.npy`` (2-D uint8, uint16, or finite non-negative float32/64).
+    limits : PictureLimits, optional
+
+    Returns
+    -------
+    pixels : (rows, cols) float32, counts
+    bit_depth : int, 8, 16, 32 or 64
+    sha256 : str, of the file's bytes
+
+    Raises
+    ------
+    ImageError
+        One line: the file's name, what is wrong, what to do.
+    """
+    limits = limits or PictureLimits()
+    path = Path(path)
+    try:
+        data = _read_bytes(path, limits.max_bytes)
+        pixels, depth = _decode(data, path.suffix.lower(), limits)
+    except ValueError as error:
+        raise ImageError(f"{path.name}: {error}") from None
+    sha256 = hashlib.sha256(data).hexdigest()
+    _log.debug("read %d bytes, %s, %d bit, sha256 %s", len(data), pixels.shape, depth, sha256)
+    return pixels, depth, sha256
+
+
+def _read_bytes(path: Path, max_bytes: int) -> bytes:
+    try:
+        # O_NONBLOCK: a named pipe must be refused, not waited for.
+        handle = os.open(
+            path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        )
+    except FileNotFoundError:
+        raise ValueError("no such file; check the path") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "invalid path"
+        raise ValueError(f"cannot be opened ({reason}); check the path") from None
+    try:
+        # before fdopen, which takes no folders
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise ValueError("is not a regular file; give the picture itself")
+        stream = os.fdopen(handle, "rb")
+    except ValueError:
+        os.close(handle)
+        raise
+    with stream:
+        info = os.fstat(stream.fileno())
+        if info.st_size > max_bytes:
+            raise ValueError(
+                f"has {info.st_size / 2**20:.0f} MiB; at most {max_bytes / 2**20:.0f} MiB are read"
+            )
+        data = stream.read(max_bytes + 1)
+    if not data:
+        raise ValueError("is empty; copy or export it again")
+    return data
+
+
+def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Image, int]:
+    expected = _SUFFIXES.get(suffix)
+    if expected is None:
+        raise ValueError("has an unknown kind of name; use .png, .tif, .tiff or .npy")
+    found = _sniff(data)
+    if found != expected:
+        what = f"is a {found} file" if found else f"is not a {expected} file"
+        raise ValueError(f"{what} though it is named {suffix}; export it as {expected}")
+    if found == "NPY":
+        return _decode_npy(data, limits)
+    check = png_guard.check_png if found == "PNG" else png_guard.check_tiff
+    depth = check(data, limits.min_side, limits.max_side)
+    try:
+        # UNCHANGED: GRAYSCALE would make 8 bit of 16 and obey an EXIF rotation.
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        picture = None
+    if picture is None or picture.dtype != {8: np.uint8, 16: np.uint16}[depth]:
+        raise ValueError("cannot be decoded (damaged or unusual); export it again as 8/16 bit grey")
+    grey = _one_channel(picture)
+    png_guard.check_sides(grey.shape[0], grey.shape[1], limits.min_side, limits.max_side)
+    return grey.astype(np.float32), depth
+
+
+def _sniff(data: bytes) -> str | None:
+    if data.startswith(png_guard.PNG_SIGNATURE):
+        return "PNG"
+    if data[:4] in png_guard.TIFF_SIGNATURES:
+        return "TIFF"
+    return "NPY" if data.startswith(_NPY_SIGNATURE) else None
+
+
+def _one_channel(picture: Array) -> Array:
+    if picture.ndim == 2:
+        return picture
+    channels = picture.shape[2]
+    if channels in (2, 4):
+        if (picture[..., -1] != np.iinfo(picture.dtype).max).any():
+            raise ValueError("has transparent pixels; export it without transparency")
+        picture = picture[..., :-1]
+    if (picture != picture[..., :1]).any():
+        raise ValueError("is a colour picture; export it as grey (R = G = B)")
+    return picture[..., 0]
+
+
+def _decode_npy(data: bytes, limits: PictureLimits) -> tuple[Image, int]:
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        readers = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }
+        if version not in readers:
+            raise ValueError
+        shape, fortran, dtype = readers[version](stream)
+    except (ValueError, TypeError, SyntaxError, EOFError, tokenize.TokenError, *_HEADER):
+        raise ValueError("has a damaged NPY header; save it again with numpy.save") from None
+    if dtype.hasobject or dtype.newbyteorder("=").name not in _NPY_DEPTH or dtype.names:
+        raise ValueError("holds other values than uint8, uint16, float32 or float64; convert it")
+    if len(shape) != 2:
+        raise ValueError(f"has {len(shape)} dimensions; save one grey picture (rows, columns)")
+    png_guard.check_sides(*shape, limits.min_side, limits.max_side)
+    if len(data) - stream.tell() != shape[0] * shape[1] * dtype.itemsize:
+        raise ValueError("is truncated or has bytes to spare; save it again with numpy.save")
+    array = np.frombuffer(data, dtype, offset=stream.tell())
+    array = array.reshape(shape, order="F" if fortran else "C")
+    if dtype.kind == "f" and not (np.isfinite(array).all() and array.min() >= 0):
+        raise ValueError("holds negative or non-finite values; grey values must be >= 0 and finite")
+    if dtype.kind == "f" and array.max() > np.finfo(np.float32).max:
+        raise ValueError("holds values too large for single precision; rescale it")
+    return np.ascontiguousarray(array, dtype=np.float32), _NPY_DEPTH[dtype.newbyteorder("=").name]

@@ -1,0 +1,201 @@
+"""From ridge response to vessel mask and skeleton."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.imaging import enhance
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.types import Array, Image, Mask
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Segmentation:
+    """Vessels of one picture, at the picture's own size.
+
+    Attributes
+    ----------
+    mask, skeleton, valid : (rows, cols) bool
+    vesselness : (rows, cols) float32, units of the picture
+    rim_share : (rows, cols) float32
+        Level of the mask's rim as a share of the peak on the nearest skeleton pixel.
+    peak : float
+        Mean rise of the skeleton above the background, units of the picture.
+    contrast : float
+        ``peak`` over the noise beside the vessels. Both are 0 where nothing was found.
+    """
+
+    mask: Mask
+    skeleton: Mask
+    valid: Mask
+    vesselness: Image
+    rim_share: Image
+    peak: float
+    contrast: float
+
+
+def segment(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions) -> Segmentation:
+    """Find bright vessels.
+
+    The search runs at ``options.work_pixel_mm``, since vessels have a known size in mm; only
+    the rim of the mask is drawn in the picture's own pixels.
+
+    Parameters
+    ----------
+    picture : (rows, cols) float32, vessels bright
+    holes : (rows, cols) bool, pixels without picture (collimator)
+    pixel_mm : float, pixel size at the isocentre
+    options : ImagingOptions
+    """
+    rows, columns = picture.shape
+    scale = min(1.0, pixel_mm / options.work_pixel_mm)
+    size = (max(16, round(columns * scale)), max(16, round(rows * scale)))
+    work = resize(enhance.fill_holes(picture, holes), size)
+    work_holes = resize(holes.astype(np.float32), size) > 0.1
+    work_mm = pixel_mm * columns / size[0]
+    flat = enhance.flatten(work, options.flatten_sigma_mm / work_mm)
+    found = enhance.ridges(flat, work_mm, options)
+    response = np.where(work_holes, np.float32(0), found.response)
+    line = centreline(response, ~work_holes, work_mm, options)
+    full = (columns, rows)
+    vesselness = np.where(holes, np.float32(0), resize(response, full))
+    if not line.any():
+        nothing = np.zeros((rows, columns), bool)
+        share = np.zeros((rows, columns), np.float32)
+        return Segmentation(
+            mask=nothing, skeleton=nothing, valid=~holes, vesselness=vesselness,
+            rim_share=share, peak=0.0, contrast=0.0,
+        )  # fmt: skip
+    rim = _rim(work, flat, line, found.sigma_px, work_mm, options)
+    mask = _draw(picture, holes, line, rim, pixel_mm)
+    return Segmentation(
+        mask=mask,
+        skeleton=skel.skeletonize(mask),
+        valid=~holes,
+        vesselness=vesselness,
+        rim_share=resize(rim.share, full),
+        peak=rim.peak,
+        contrast=rim.contrast,
+    )
+
+
+def centreline(response: Image, valid: Mask, pixel_mm: float, options: ImagingOptions) -> Mask:
+    """(rows, cols) bool: hysteresis, small parts, straight wires, spurs and weak ends."""
+    if not valid.any():
+        return np.zeros_like(valid)
+    top = float(np.percentile(response[valid], 99))
+    if top <= 0:
+        return np.zeros_like(valid)
+    strong = response > options.high_share * top
+    line = skel.skeletonize(skel.parts_touching(response > options.low_share * top, strong))
+    line = skel.strong_parts(line, response, options.part_share)
+    line = _without_wires(line, options.straight_share)
+    line = skel.prune(line, response, options.spur_mm / pixel_mm, options.weak_share * top)
+    if not line.any():
+        return line
+    return skel.strong_parts(line, response, options.part_share)
+
+
+def _without_wires(line: Mask, share: float) -> Mask:
+    """Cut straight lines longer than any vessel runs straight: wires, sternum, shutter edges."""
+    length = share * min(line.shape)
+    wires = cv2.HoughLinesP(
+        line.astype(np.uint8), 1, np.pi / 360, threshold=int(0.5 * length),
+        minLineLength=length, maxLineGap=0.03 * length,
+    )  # fmt: skip
+    if wires is None:
+        return line
+    drawn = np.zeros(line.shape, np.uint8)
+    for x0, y0, x1, y1 in wires.reshape(-1, 4):
+        # A wire goes on beyond the stretch that was found.
+        dx, dy = (x1 - x0) // 2, (y1 - y0) // 2
+        cv2.line(drawn, (int(x0 - dx), int(y0 - dy)), (int(x1 + dx), int(y1 + dy)), 1, 7)
+    return line & (drawn == 0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class _Rim:
+    """The mask is where the picture exceeds ``ground + level`` and ``room`` is positive."""
+
+    ground: Image
+    level: Image
+    room: Image
+    share: Image
+    peak: float
+    contrast: float
+
+
+def _rim(
+    work: Image, flat: Image, line: Mask, sigma_px: Image, pixel_mm: float, options: ImagingOptions
+) -> _Rim:
+    """Set the rim's level between noise and peak.
+
+    A chord through a round vessel is 2 sqrt(R^2 - x^2): the rim lies at level 0, and only
+    noise forbids to look for it there. So the level is a multiple of the noise, bounded on
+    both sides by shares of the peak.
+    """
+    margin, fill = options.margin_mm / pixel_mm, options.fill_sigma_mm / pixel_mm
+    distance, (sigma,) = skel.spread(line, (sigma_px,), 3.0)
+    room = options.reach_sigmas * sigma + 1.0 - distance
+    # First the whole reach counts as vessel, then what the first rim encloses.
+    grown = room > 0
+    for _ in range(2):
+        ground = enhance.background(flat, grown, margin, fill)
+        rise = cv2.GaussianBlur(flat - ground, (0, 0), 0.8)
+        noise = _noise_beside(rise, grown)
+        _, (peak,) = skel.spread(line, (rise,), 3.0)
+        peak = np.maximum(peak, 1e-12)
+        level = np.clip(options.rim_noise * noise, options.rim_low * peak, options.rim_high * peak)
+        grown = ((rise > level) & (room > 0)) | line
+    return _Rim(
+        ground=work - flat + ground,
+        level=level,
+        room=room,
+        share=level / peak,
+        peak=float(peak[line].mean()),
+        contrast=float(peak[line].mean() / max(noise, 1e-12)),
+    )
+
+
+def _noise_beside(rise: Array, vessel: Mask) -> float:
+    grown = vessel.astype(np.uint8)
+    close = cv2.dilate(grown, np.ones((7, 7), np.uint8)) > 0
+    around = (cv2.dilate(grown, np.ones((31, 31), np.uint8)) > 0) & ~close
+    if not around.any():
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(rise[around])))
+
+
+def _draw(picture: Image, holes: Mask, line: Mask, rim: _Rim, pixel_mm: float) -> Mask:
+    """Draw the rim in the picture's own pixels from the coarse level, limit and background."""
+    full = picture.shape[::-1]
+    blur = 0.8 * picture.shape[1] / line.shape[1]
+    fine = cv2.GaussianBlur(enhance.fill_holes(picture, holes), (0, 0), blur)
+    inside = (fine - resize(rim.ground, full) > resize(rim.level, full)) & ~holes
+    inside &= resize(rim.room, full) > 0
+    seeds = cv2.resize(line.astype(np.uint8), full, interpolation=cv2.INTER_NEAREST) > 0
+    inside |= seeds & ~holes
+    return _fill_specks(skel.parts_touching(inside, seeds & ~holes), 1.0 / pixel_mm**2)
+
+
+def _fill_specks(mask: Mask, largest_px: float) -> Mask:
+    """Fill enclosed holes smaller than a vessel: each would be a loop of the skeleton."""
+    _, label, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= largest_px
+    small[0] = False
+    return mask | small[label]
+
+
+def resize(picture: Image, size: tuple[int, ...]) -> Image:
+    """Resample to (columns, rows): area average when shrinking, linear when growing."""
+    rows, columns = picture.shape
+    if size == (columns, rows):
+        return picture
+    shrink = size[0] < columns
+    interpolation = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+    size = (size[0], size[1])
+    return np.asarray(cv2.resize(picture, size, interpolation=interpolation), dtype=np.float32)

@@ -1,0 +1,110 @@
+"""One-pixel-wide centrelines of masks, and what hangs on them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gcar_deploy.types import Array, Image, Mask, Scalars
+
+_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+_BLOCK = np.ones((3, 3), np.uint8)
+
+
+def skeletonize(mask: Mask) -> Mask:
+    """Thin a (rows, cols) mask to lines one pixel wide; connected stays connected.
+
+    Guo and Hall's thinning. A border of one pixel is added first, since the filter leaves the
+    outermost pixels alone.
+    """
+    padded = cv2.copyMakeBorder(mask.astype(np.uint8) * 255, 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    thin = cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_GUOHALL)
+    return np.ascontiguousarray(thin[2:-2, 2:-2] > 0)
+
+
+def neighbours(skeleton: Mask) -> Array:
+    """(rows, cols) uint8: how many of the eight neighbours are skeleton."""
+    return cv2.filter2D(skeleton.astype(np.uint8), -1, _RING, borderType=cv2.BORDER_CONSTANT)
+
+
+def prune(
+    skeleton: Mask, strength: Image, shortest_px: float, weakest: float, passes: int = 3
+) -> Mask:
+    """Cut ends that are short or weak.
+
+    Parameters
+    ----------
+    skeleton : (rows, cols) bool
+    strength : (rows, cols) float32, ridge response
+    shortest_px : float
+        A segment between an end and a fork with fewer pixels is a spur.
+    weakest : float
+        An end segment with a lower mean strength goes, however long.
+    passes : int
+        Cutting one end makes another.
+    """
+    for _ in range(passes):
+        count = neighbours(skeleton)
+        forks = skeleton & (count >= 3)
+        segments = skeleton & ~forks
+        n, label = cv2.connectedComponents(segments.astype(np.uint8), connectivity=8)
+        pixels, mean = _segment_means(label, segments, strength, n)
+        at_end, at_fork = np.zeros(n, bool), np.zeros(n, bool)
+        at_end[label[segments & (count <= 1)]] = True
+        at_fork[label[cv2.dilate(forks.astype(np.uint8), _BLOCK) > 0]] = True
+        cut = at_end & (((pixels < shortest_px) & at_fork) | (mean < weakest))
+        cut[0] = False
+        if not cut.any():
+            break
+        skeleton = skeletonize(skeleton & ~cut[label])
+    return skeleton
+
+
+def _segment_means(label: Array, inside: Mask, strength: Image, n: int) -> tuple[Scalars, Scalars]:
+    pixels = np.bincount(label[inside], minlength=n).astype(np.float64)
+    total = np.bincount(label[inside], weights=strength[inside], minlength=n)
+    return pixels, total / np.maximum(pixels, 1)
+
+
+def strong_parts(skeleton: Mask, strength: Image, share: float) -> Mask:
+    """Keep connected parts whose summed strength is at least ``share`` of the best part's."""
+    n, label = cv2.connectedComponents(skeleton.astype(np.uint8), connectivity=8)
+    total = np.bincount(label[skeleton], weights=strength[skeleton], minlength=n)
+    keep = total >= share * total.max()
+    keep[0] = False
+    return keep[label]
+
+
+def parts_touching(mask: Mask, seeds: Mask) -> Mask:
+    """Keep the connected parts of ``mask`` that hold at least one seed."""
+    n, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    keep = np.zeros(n, bool)
+    keep[label[seeds]] = True
+    keep[0] = False
+    return keep[label]
+
+
+def spread(
+    skeleton: Mask, values: tuple[Array, ...], smooth_px: float
+) -> tuple[Image, tuple[Image, ...]]:
+    """Average values along the skeleton and carry them to every pixel.
+
+    Returns
+    -------
+    distance : (rows, cols) float32
+        To the nearest skeleton pixel, pixels.
+    carried : tuple of (rows, cols) float32
+        Each value at that skeleton pixel, after a Gaussian average along the line.
+    """
+    distance, label = cv2.distanceTransformWithLabels(
+        (~skeleton).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    weight = cv2.GaussianBlur(skeleton.astype(np.float32), (0, 0), smooth_px)
+    carried = []
+    for value in values:
+        on_line = np.where(skeleton, value, 0).astype(np.float32)
+        mean = cv2.GaussianBlur(on_line, (0, 0), smooth_px) / np.maximum(weight, 1e-9)
+        table = np.zeros(int(label.max()) + 1, np.float32)
+        table[label[skeleton]] = mean[skeleton]
+        carried.append(table[label])
+    return np.asarray(distance, dtype=np.float32), tuple(carried)

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.imaging import enhance, segment
+from tests.imaging.phantoms import PIXEL_MM, raw_picture, tube_paths
+
+
+def _line(width, size=129, angle=0.0):
+    row, column = np.indices((size, size), dtype=np.float64) - (size - 1) / 2
+    across = row * np.cos(angle) - column * np.sin(angle)
+    return np.exp(-(across**2) / (2 * width**2)).astype(np.float32)
+
+
+@pytest.mark.parametrize("width", [2.0, 3.0, 5.0])
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4, 2.0])
+def test_gaussian_ridge_has_the_closed_form_response(width, angle):
+    # Blurred by s a ridge of width w has w' = sqrt(w^2 + s^2) and height w / w'; curvature
+    # height / w'^2, and a drop height (1 - exp(-(g s)^2 / 2 w'^2)) to each side.
+    picture, gap = _line(width, angle=angle), 2.5
+    for sigma in (2.0, 3.0, 5.0):
+        wide = np.hypot(width, sigma)
+        height = width / wide
+        drop = height * (1 - np.exp(-((gap * sigma / wide) ** 2) / 2))
+        expected = sigma * np.sqrt(height / wide**2 * drop)
+        middle = enhance.ridge_response(picture, sigma, gap)[60:68, 60:68].max()
+        assert middle == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize("width", [2.0, 3.0, 4.0, 6.0])
+def test_response_peaks_at_a_scale_that_grows_with_the_width(width):
+    # -s^2 L'' alone peaks at s = sqrt(2) w; the drop to the sides moves that by a constant
+    # factor, so the best scale is proportional to w.
+    sigmas = np.geomspace(1.0, 20.0, 40)
+    picture = _line(width, size=257)
+    values = [enhance.ridge_response(picture, s, 2.5)[128, 128] for s in sigmas]
+    wide = np.hypot(1.0, sigmas / width)  # the closed form in units of the width
+    form = sigmas / width / wide**2 * np.sqrt(1 - np.exp(-((2.5 * sigmas / width / wide) ** 2) / 2))
+    best, expected = sigmas[int(np.argmax(values))], sigmas[int(np.argmax(form))]
+    assert best / expected == pytest.approx(1.0, abs=0.1)
+    assert 0.8 < best / width < 2.0
+
+
+def test_step_edge_answers_much_less_than_a_line():
+    edge = np.zeros((96, 96), np.float32)
+    edge[48:] = 1
+    line = np.zeros((96, 96), np.float32)
+    line[46:51] = 1
+    for sigma in (1.5, 3.0):
+        edge_response = enhance.ridge_response(edge, sigma, 2.5)[20:-20, 20:-20].max()
+        line_response = enhance.ridge_response(line, sigma, 2.5)[20:-20, 20:-20].max()
+        assert edge_response < 0.02 * line_response
+
+
+def test_polarity_is_seen_and_symmetric():
+    picture, options = raw_picture(tube_paths()), ImagingOptions()
+    dark, margin = enhance.vessels_are_dark(picture, PIXEL_MM, options)
+    bright, other = enhance.vessels_are_dark(255 - picture, PIXEL_MM, options)
+    assert dark and not bright
+    assert margin > 3 and other > 3
+
+
+def test_collimator_is_found_and_a_dark_picture_is_not_one():
+    picture = raw_picture(tube_paths())
+    row, column = np.indices(picture.shape)
+    outside = np.hypot(row - 128, column - 128) > 140
+    holes = enhance.collimator(np.where(outside, np.float32(6), picture))
+    assert holes[outside].mean() > 0.95
+    assert holes[~outside].mean() < 0.12
+    assert not enhance.collimator(picture).any()
+    assert not enhance.collimator(np.full((64, 64), 3, np.float32)).any()
+
+
+def test_background_fills_a_plane_in_to_a_tenth_of_the_contrast():
+    row, column = np.indices((96, 96), dtype=np.float32)
+    plane = 0.5 * row - 0.2 * column
+    vessel = np.zeros((96, 96), bool)
+    vessel[45:51, 10:80] = True
+    filled = enhance.background(plane + 30 * vessel, vessel, 2.0, 5.0)
+    assert np.abs(filled - plane)[vessel].max() < 2.0
+
+
+def test_straight_wire_goes_and_a_bent_vessel_stays():
+    vessel = np.zeros((200, 200), np.uint8)
+    cv2.ellipse(vessel, (100, 100), (60, 45), 0, 0, 250, 1, 1)
+    both = vessel.copy()
+    cv2.line(both, (185, 0), (170, 199), 1, 1)
+    left = segment._without_wires(both > 0, 0.6)
+    assert (left & (vessel > 0)).sum() >= 0.98 * (vessel > 0).sum()
+    assert left[:, 165:].sum() < 20  # of 200

@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.errors import GeometryError, ImageError, RefusedError
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.resample import area_average, resized
+from tests.conftest import data_dir
+from tests.imaging.phantoms import PIXEL_MM, angiogram, raw_picture, tube_paths
+
+_OPTIONS = ImagingOptions()
+
+
+def _dice(a, b):
+    return 2 * (a & b).sum() / (a.sum() + b.sum())
+
+
+def test_path_length_is_exact():
+    truth = tube_paths()
+    counts = np.round(truth / 0.001)
+    found = extract_vessels(angiogram(counts, "path_length", mm_per_count=0.001), _OPTIONS)
+    assert found.calibrated and found.kind == "path_length" and found.vesselness is None
+    np.testing.assert_array_equal(found.mask, counts * np.float32(0.001) > 0.1 * PIXEL_MM)
+    np.testing.assert_allclose(found.path_mm[found.mask], truth[found.mask], atol=6e-4)
+    assert (found.path_mm[~found.mask] == 0).all()
+    assert not (found.skeleton & ~found.mask).any()
+
+
+def test_thin_vessel_survives_in_coarse_path_lengths():
+    # 0.6 mm vessel in 1.4 mm pixels: below half a pixel wide
+    fine = tube_paths(size=512, radius_mm=0.3, pixel_mm=0.15, oversample=2)
+    coarse = area_average(fine, 55, 55)
+    found = extract_vessels(
+        angiogram(coarse, "path_length", pixel_mm=512 * 0.15 / 55, mm_per_count=1.0), _OPTIONS
+    )
+    line = area_average((fine > 0.5).astype(np.float32), 55, 55) > 0.15
+    assert found.mask[line].mean() > 0.95
+
+
+@pytest.mark.parametrize("radius_mm", [0.9, 1.5, 2.2])
+def test_raw_tube_gives_mask_and_path_within_a_stated_tolerance(radius_mm):
+    truth = tube_paths(radius_mm=radius_mm)
+    found = extract_vessels(angiogram(raw_picture(truth)), _OPTIONS)
+    assert not found.calibrated and found.kind == "raw"
+    assert _dice(found.mask, truth > 0.3 * radius_mm) > 0.85
+    both = found.mask & (truth > radius_mm)
+    assert np.median(found.path_mm[both] / truth[both]) == pytest.approx(1.0, abs=0.15)
+    assert np.corrcoef(found.path_mm[both | found.mask], truth[both | found.mask])[0, 1] > 0.85
+    assert np.isfinite(found.path_mm).all() and (found.path_mm >= 0).all()
+
+
+def test_polarity_declared_or_seen_gives_the_same_vessels():
+    picture = raw_picture(tube_paths(), gain=0.04)
+    dark = extract_vessels(angiogram(picture, polarity="dark"), _OPTIONS)
+    seen = extract_vessels(angiogram(picture), _OPTIONS)
+    np.testing.assert_array_equal(dark.mask, seen.mask)
+    negative = 255 - picture
+    for polarity in ("bright", "auto"):
+        turned = extract_vessels(angiogram(negative, polarity=polarity), _OPTIONS)
+        assert _dice(turned.mask, dark.mask) > 0.9
+
+
+def test_sixteen_bit_equals_eight_bit_within_quantisation():
+    light = raw_picture(tube_paths(), noise=0.0)
+    noise = np.random.default_rng(3).normal(0, 1.5, light.shape)
+    eight = np.clip(np.round(light + noise), 0, 255)
+    sixteen = np.clip(np.round((light + noise) * 257), 0, 65535)
+    a, b = (extract_vessels(angiogram(p), _OPTIONS) for p in (eight, sixteen))
+    assert _dice(a.mask, b.mask) > 0.97
+    assert b.path_mm.sum() == pytest.approx(a.path_mm.sum(), rel=0.03)
+
+
+def test_attenuation_scale_does_not_matter():
+    truth = tube_paths()
+    noise = np.random.default_rng(4).normal(0, 0.05, truth.shape)
+    results = [
+        extract_vessels(angiogram(gain * (truth + noise + 1), "attenuation"), _OPTIONS)
+        for gain in (1.0, 250.0)
+    ]
+    np.testing.assert_allclose(results[0].path_mm, results[1].path_mm, atol=2e-3)
+    both = results[0].mask & (truth > 1)
+    ratio = np.median(results[0].path_mm[both] / truth[both])
+    assert ratio == pytest.approx(1.0, abs=0.15)
+    assert not results[0].calibrated
+
+
+_N = 256
+_RNG = np.random.default_rng(5)
+_EMPTY = {
+    "black": np.zeros((_N, _N)),
+    "white": np.full((_N, _N), 255),
+    "grey": np.full((_N, _N), 77),
+    "noise": 128 + 8 * _RNG.standard_normal((_N, _N)),
+    "ramp": np.add.outer(np.arange(_N), np.arange(_N)) * 0.2 + 20,
+    "edge": np.repeat([200.0, 90.0], _N // 2)[:, None] + 3 * _RNG.standard_normal((_N, _N)),
+    "one hot pixel": np.eye(1, _N * _N, 700).reshape(_N, _N) * 255,
+}
+
+
+@pytest.mark.parametrize("kind", ["raw", "attenuation"])
+@pytest.mark.parametrize("name", sorted(_EMPTY))
+def test_no_vessel_is_refused_with_the_view(name, kind):
+    with (
+        np.errstate(divide="raise", invalid="raise", over="raise"),
+        pytest.raises(RefusedError, match="no vessel found in view 2"),
+    ):
+        extract_vessels(angiogram(_EMPTY[name], kind), _OPTIONS)
+
+
+@pytest.mark.parametrize("name", ["black", "white", "grey"])
+def test_no_path_is_refused(name):
+    with pytest.raises(RefusedError, match="no vessel found in view 2"):
+        extract_vessels(angiogram(_EMPTY[name], "path_length", mm_per_count=0.01), _OPTIONS)
+    with pytest.raises(RefusedError, match="longer than"):
+        faint = np.zeros((64, 64))
+        faint[3, 3] = 1
+        extract_vessels(angiogram(faint, "path_length", mm_per_count=1e-6), _OPTIONS)
+
+
+def test_path_length_needs_a_scale_and_bright_vessels():
+    with pytest.raises(GeometryError, match="mm_per_count"):
+        extract_vessels(angiogram(tube_paths(), "path_length"), _OPTIONS)
+    with pytest.raises(GeometryError, match="bright"):
+        extract_vessels(
+            angiogram(tube_paths(), "path_length", mm_per_count=1.0, polarity="dark"), _OPTIONS
+        )
+
+
+def test_wrong_shape_is_an_error():
+    import dataclasses
+
+    with pytest.raises(ImageError, match="the geometry says"):
+        dataclasses.replace(angiogram(np.zeros((32, 32))), pixels=np.zeros((32, 31), np.float32))
+
+
+def test_same_input_same_bytes():
+    picture = raw_picture(tube_paths())
+    first, second = (extract_vessels(angiogram(picture), _OPTIONS) for _ in range(2))
+    assert first.path_mm.tobytes() == second.path_mm.tobytes()
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (128, 128), (100, 77), (256, 31), (300, 400)])
+def test_resized_keeps_the_mass_and_the_line(shape):
+    counts = np.round(tube_paths() / 0.001)
+    old = extract_vessels(angiogram(counts, "path_length", mm_per_count=0.001), _OPTIONS)
+    new = resized(old, *shape)
+    assert new.mask.shape == shape == (new.carm.rows, new.carm.columns)
+    ratio = (256 * 256) / (shape[0] * shape[1])
+    assert new.path_mm.sum(dtype=np.float64) * ratio == pytest.approx(
+        old.path_mm.sum(dtype=np.float64), rel=1e-5
+    )
+    assert new.skeleton.any() and not (new.skeleton & ~new.mask).any()
+
+
+def test_area_average_by_a_whole_factor_is_the_block_mean():
+    picture = np.random.default_rng(0).random((32, 48)).astype(np.float32)
+    blocks = picture.reshape(8, 4, 12, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(area_average(picture, 8, 12), blocks, rtol=1e-5)
+
+
+def test_real_and_simulated_pictures():
+    from gcar_export import segmentation_table as table
+
+    data = data_dir()
+    pairs = sorted(table.find(data, "xca_masks").glob("*_gt.png"))
+    cases = table.find(data, "cases")
+    if not pairs or not any(cases.glob("R_*")):
+        pytest.skip("no expert masks or raw cases in GCAR_DATA")
+    assert np.mean([table.expert_score(p)[0]["Dice"] for p in pairs]) > 0.72
+    for name, scores, _, _ in table.case_scores(cases):
+        assert scores["Dice"] > 0.8 and scores["clDice"] > 0.9, name
+        assert scores["correlation"] > 0.85 and 0.75 < scores["scale"] < 1.25, name

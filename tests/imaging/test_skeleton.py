@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcar_deploy.imaging import skeleton as skel
+
+
+def _strokes(points, width, size=80):
+    mask = np.zeros((size, size), np.uint8)
+    cv2.polylines(mask, [np.array(points, np.int32)], False, 1, width)
+    return mask > 0
+
+
+_points = st.lists(st.tuples(st.integers(0, 79), st.integers(0, 79)), min_size=2, max_size=6)
+
+
+@settings(max_examples=80, deadline=None)
+@given(_points, st.integers(1, 9))
+def test_thin_subset_and_as_many_parts(points, width):
+    mask = _strokes(points, width)
+    line = skel.skeletonize(mask)
+    assert not (line & ~mask).any()
+    parts = [cv2.connectedComponents(m.astype(np.uint8), connectivity=8)[0] for m in (mask, line)]
+    assert parts[0] == parts[1]
+    # one pixel wide: no 2x2 block but at crossings, where four lines may meet
+    blocks = line[1:, 1:] & line[:-1, 1:] & line[1:, :-1] & line[:-1, :-1]
+    assert blocks.sum() <= max(2, 0.02 * line.sum())
+
+
+def test_one_pixel_vessel_and_stub_stay():
+    mask = np.zeros((40, 40), bool)
+    mask[20, 3:37] = True
+    np.testing.assert_array_equal(skel.skeletonize(mask), mask)
+    stub = np.zeros((40, 40), bool)
+    stub[5, 5:7] = True
+    assert skel.skeletonize(stub).sum() >= 1
+
+
+def test_reaches_the_border():
+    mask = np.zeros((40, 60), bool)
+    mask[18:23, :] = True
+    line = skel.skeletonize(mask)
+    assert line[:, :3].any() and line[:, -3:].any()
+    border = np.zeros((40, 60), bool)
+    border[0, :] = True
+    assert skel.skeletonize(border).sum() >= 58
+
+
+def test_prune_cuts_spurs_and_weak_ends_only():
+    line = np.zeros((60, 100), bool)
+    line[30, 5:95] = True
+    line[26:30, 50] = True  # a spur of 4 pixels
+    line[10:30, 70] = True  # a branch of 20
+    strength = np.ones(line.shape, np.float32)
+    kept = skel.prune(line, strength, 8, 0.0)
+    assert not kept[26:29, 50].any() and kept[12:28, 70].all() and kept[30, 10:90].sum() >= 78
+    strength[:25, 70] = 0.0
+    assert not skel.prune(line, strength, 8, 0.5)[12:28, 70].any()
+
+
+def test_strong_parts_and_spread():
+    line = np.zeros((50, 50), bool)
+    line[10, 5:45] = True
+    line[40, 5:8] = True
+    ones = np.ones(line.shape, np.float32)
+    kept = skel.strong_parts(line, ones, 0.2)
+    assert kept[10].sum() == 40 and not kept[40].any()
+    distance, (carried,) = skel.spread(kept, (3 * ones,), 2.0)
+    np.testing.assert_allclose(carried, 3.0, rtol=1e-4)
+    assert abs(distance[30, 20] - 20) < 0.2
