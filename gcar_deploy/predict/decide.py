@@ -1,0 +1,94 @@
+"""From confidences to a decision: every pixel explained once, vessels whole.
+
+The network hedges where two places explain a pixel equally well: both get a little. The decision
+minimises, by mean field with falling temperature,
+
+    E(x) = - sum_i x_i logit_i                     what the network says
+           - J sum_i x_i (min(sum_nbrs x, m) - m/2)  a vessel cell has vessel neighbours
+           + sum_rays (sum_i w_i x_i - path)^2 / 2c  each ray's path is accounted for once
+
+with one multiplier per ray for the last term (a relaxed entropic projection). Where the picture
+is not calibrated, its paths are first scaled to what the network expects of the view as a whole,
+and held more loosely.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.special import expit, logit
+
+from gcar_deploy.config import DecideOptions
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.predict.encoding import Encoded
+from gcar_deploy.types import Array, Scalars
+
+
+def decide(
+    centers: CenterPoints, encoded: Encoded, calibrated: bool, options: DecideOptions
+) -> CenterPoints:
+    """Sharpen the confidences of ``centers``; points, order and count stay as they are.
+
+    Parameters
+    ----------
+    centers : CenterPoints, one per candidate of ``encoded``
+    encoded : Encoded
+    calibrated : bool, whether path lengths are true mm in every view
+    options : DecideOptions
+    """
+    evidence = logit(np.clip(centers.confidence, 1e-4, 1 - 1e-4))
+    views = _Rays.of(encoded, centers.confidence, calibrated, options)
+    x = expit(evidence)
+    padded = np.zeros(len(x) + 1)
+    neighbours = np.ascontiguousarray(encoded.neighbours[0].T)
+    for step in range(options.steps):
+        share = step / max(options.steps - 1, 1)
+        beta = 1.0 + (options.final_sharpness - 1.0) * share
+        padded[:-1] = x
+        around = padded[neighbours].sum(axis=0) - x
+        enough = np.minimum(around, options.enough_neighbours) - 0.5 * options.enough_neighbours
+        field = beta * (evidence + options.coupling * enough)
+        x = 0.5 * (x + views.project(field, beta))
+    return dataclasses.replace(centers, confidence=x)
+
+
+@dataclasses.dataclass(eq=False)
+class _Rays:
+    """Rays of all views with their multipliers."""
+
+    ray: Array
+    path: list[Array]
+    weight: Array
+    pull: list[Array]
+    looseness: float
+
+    @staticmethod
+    def of(encoded: Encoded, expected: Scalars, calibrated: bool, options: DecideOptions) -> _Rays:
+        path = []
+        for ray, p, w in zip(encoded.ray, encoded.ray_path, encoded.weight, strict=True):
+            # Padding rays behind no point have no say.
+            seen = p[: int(ray.max()) + 1].astype(np.float64) if len(ray) else p[:0]
+            if not calibrated:
+                seen = seen * np.clip((expected * w).sum() / max(seen.sum(), 1e-9), 0.25, 4.0)
+            path.append(seen)
+        loose = options.looseness if calibrated else options.looseness_uncalibrated
+        weight = encoded.weight.astype(np.float64)
+        return _Rays(encoded.ray, path, weight, [np.zeros(len(p)) for p in path], loose)
+
+    def project(self, field: Scalars, beta: float) -> Scalars:
+        """Occupancies for ``field`` after one Newton pass over each view's multipliers."""
+        soft = self.looseness / beta
+        total = field.copy()
+        for ray, weight, pull in zip(self.ray, self.weight, self.pull, strict=True):
+            total += pull[ray] * weight
+        for ray, path, weight, pull in zip(
+            self.ray, self.path, self.weight, self.pull, strict=True
+        ):
+            x = expit(total)
+            made = np.bincount(ray, x * weight, len(path))
+            slope = np.bincount(ray, x * (1 - x) * weight * weight, len(path)) + soft
+            change = -np.clip((made - path + soft * pull) / slope, -1.5, 1.5)
+            pull += change
+            total += change[ray] * weight
+        return expit(total)

@@ -1,0 +1,153 @@
+"""What the sparse predictor sees: features, neighbours, coarse cells and rays as plain arrays.
+
+Training and deployment share this file, so they cannot drift apart. Every array is an input
+of the ONNX graph, which itself holds only gathers, matrix products and scatters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.predict.candidates import Candidates, bilinear
+from gcar_deploy.types import Array, Image
+
+#: number of per-view features that ``encode`` makes; part of the model's spec
+VIEW_FEATURES = 12
+#: coarser levels above the lattice itself
+LEVELS = 3
+_OFFSETS = np.array(
+    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Encoded:
+    """Inputs of the sparse predictor for one scene of n points and V views.
+
+    Attributes
+    ----------
+    features : (V, n, VIEW_FEATURES) float32
+    ray : (V, n) int64, id of the pixel's ray within the view, dense from 0
+    ray_path : (V, r) float32, path length of each ray in lattice cells (padded with zeros)
+    weight : (V, n) float32, share of the ray's chord that one full cell accounts for, cells
+    neighbours : per level (n_l, 27) int64, index into the level, n_l where there is none
+    parent : per level but the last (n_l,) int64, index into the next level
+    """
+
+    features: Array
+    ray: Array
+    ray_path: Array
+    weight: Array
+    neighbours: tuple[Array, ...]
+    parent: tuple[Array, ...]
+
+
+def encode(candidates: Candidates, views: Sequence[tuple[CArm, Image, bool]]) -> Encoded:
+    """Describe candidates by what each view shows at and around their projections.
+
+    Parameters
+    ----------
+    candidates : Candidates
+    views : sequence of (CArm, path_mm, calibrated)
+        As given to ``visual_hull``; ``calibrated`` says whether path lengths are true mm.
+    """
+    h = candidates.spacing_mm
+    per_view = [
+        _view_inputs(candidates, carm, path, calibrated, h) for carm, path, calibrated in views
+    ]
+    longest = max((len(p[2]) for p in per_view), default=1)
+    ray_path = np.zeros((len(per_view), max(longest, 1)), np.float32)
+    for k, p in enumerate(per_view):
+        ray_path[k, : len(p[2])] = p[2]
+    neighbours, parent = _levels(candidates.index)
+    return Encoded(
+        features=np.stack([p[0] for p in per_view]),
+        ray=np.stack([p[1] for p in per_view]),
+        ray_path=ray_path,
+        weight=np.stack([p[3] for p in per_view]),
+        neighbours=neighbours,
+        parent=parent,
+    )
+
+
+def _view_inputs(
+    candidates: Candidates, carm: CArm, path_mm: Image, calibrated: bool, h: float
+) -> tuple[Array, Array, Array, Array]:
+    pixels, depth = carm.project(candidates.points_mm)
+    path = (path_mm / h).astype(np.float32)
+    rows, cols = path.shape
+    col = np.clip(np.rint(pixels[:, 0]), 0, cols - 1).astype(np.int64)
+    row = np.clip(np.rint(pixels[:, 1]), 0, rows - 1).astype(np.int64)
+    flat, ray, count = np.unique(row * cols + col, return_inverse=True, return_counts=True)
+    # One full cell on its own covers h^3 / (pixel area at its depth) of path on the pixel.
+    f_col, f_row = carm.focal_px
+    weight = (h * f_col / depth) * (h * f_row / depth)
+    maps = [
+        path,
+        cv2.blur(path, (3, 3), borderType=cv2.BORDER_CONSTANT),
+        cv2.blur(path, (5, 5), borderType=cv2.BORDER_CONSTANT),
+        cv2.blur(path, (9, 9), borderType=cv2.BORDER_CONSTANT),
+        cv2.dilate(path, np.ones((3, 3), np.uint8)),
+        cv2.erode(path, np.ones((3, 3), np.uint8)),
+    ]
+    sampled = [bilinear(m, pixels) for m in maps]
+    inside = cv2.distanceTransform((path > 0).astype(np.uint8), cv2.DIST_L2, 3)
+    n_ray = count[ray]
+    features = np.stack(
+        [
+            np.minimum(sampled[0], 8) / 2,
+            np.minimum(sampled[1], 8) / 2,
+            np.minimum(sampled[2], 8),
+            np.minimum(sampled[3], 8) * 2,
+            np.minimum(sampled[4], 8) / 2,
+            np.minimum(sampled[5], 8) / 2,
+            np.minimum(path[row, col], 8) / 2,
+            np.log(n_ray) / 2,
+            2 * np.minimum(path[row, col] / n_ray, 1.5),
+            np.minimum(bilinear(inside, pixels), 6) / 2,
+            np.full(len(depth), float(calibrated)),
+            weight / 2,
+        ],
+        axis=1,
+    ).astype(np.float32)
+    ray_path = path.ravel()[flat]
+    return features, ray.reshape(-1).astype(np.int64), ray_path, weight.astype(np.float32)
+
+
+def _levels(index: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    neighbours, parents = [], []
+    for level in range(LEVELS + 1):
+        neighbours.append(_neighbours(index))
+        if level == LEVELS:
+            break
+        coarse = index // 2
+        span = coarse.max(axis=0) + 1 if len(coarse) else np.ones(3, np.int64)
+        keys, parent = np.unique(np.ravel_multi_index(coarse.T, span), return_inverse=True)
+        parents.append(parent.reshape(-1).astype(np.int64))
+        index = np.stack(np.unravel_index(keys, span), axis=1)
+    return tuple(neighbours), tuple(parents)
+
+
+def _neighbours(index: Array) -> Array:
+    """(n, 27) rows of ``index`` (unique, sorted) that touch each row; n where none does."""
+    n = len(index)
+    span = index.max(axis=0) + 3 if n else np.ones(3, np.int64)
+    stride = np.array([span[1] * span[2], span[2], 1])
+    keys = (index + 1) @ stride
+    out = np.full((n, 27), n, np.int64)
+    out[:, 13] = np.arange(n)
+    for k in range(13):
+        # Offset k and its opposite 26 - k are found by one search.
+        wanted = keys + _OFFSETS[k] @ stride
+        at = np.searchsorted(keys, wanted)
+        at[at == n] = 0
+        hit = keys[at] == wanted if n else np.zeros(0, bool)
+        here, there = np.nonzero(hit)[0], at[hit]
+        out[here, k] = there
+        out[there, 26 - k] = here
+    return out
