@@ -152,9 +152,9 @@ class TubeOptions:
     """The default refiner: tubes fitted to the pictures by Gauss-Newton."""
 
     #: working pixel at the isocentre per level, coarse to fine; 0 is the picture's own, mm
-    levels_mm: tuple[float, ...] = (1.0, 0.5, 0.0)
+    levels_mm: tuple[float, ...] = (1.0, 0.0)
     #: most Gauss-Newton steps per level
-    steps: tuple[int, ...] = (5, 4, 4)
+    steps: tuple[int, ...] = (6, 5)
     #: noise of the path length: constant part, and share of the path, per mm^2 of picture
     noise_mm: float = 0.4
     noise_share: float = 0.05
@@ -176,6 +176,15 @@ class TubeOptions:
     tolerance: float = 3e-3
     #: a branch or a free end is dropped where less than this share of it is seen in some view
     min_seen: float = 0.4
+    #: branches are judged in pieces of at most this length, mm
+    piece_mm: float = 100.0
+    #: cost of a mm of piece per confidence below ``fair_confidence``, units of the objective
+    piece_cost: float = 20.0
+    fair_confidence: float = 0.7
+    #: a piece standing alone is at most so many times as thick as the starting points say
+    piece_growth: float = 1.5
+    #: a piece is kept from this share on; 0 keeps all
+    min_share: float = 0.5
     #: free ends grow along what no tube explains, at most this far, mm
     max_growth_mm: float = 25.0
     #: prior on the geometry that the stated sigma includes: angles, and table position
@@ -208,12 +217,46 @@ class VolumeOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PaperOptions:
+    """The paper's refinement: Gaussians, Adam, adaptive density control."""
+
+    #: weight of the plain projection loss; the centreline loss has the rest (the paper's 0.5)
+    alpha: float = 0.5
+    steps: int = 150
+    #: pictures are sampled to this pixel at the isocentre (the paper's 128^2), mm
+    pixel_mm: float = 1.0
+    #: learning rates: mm, log scale through its sigmoid, quaternion, softplus intensity
+    rate_mean_mm: float = 0.05
+    rate_scale: float = 0.05
+    rate_rotation: float = 0.02
+    rate_intensity: float = 0.05
+    #: rates fall to this share of themselves over the steps
+    final_rate: float = 0.2
+    #: start: points at least so confident, sigma in cells, and the cap that always holds
+    least_confidence: float = 0.3
+    initial_sigma_cells: float = 0.55
+    most_gaussians: int = 10_000
+    #: bounds of the standard deviations
+    least_sigma_pixels: float = 0.25
+    largest_sigma_mm: float = 10.0
+    #: density control: steps between, pull against the mean pull, size that splits, mass that goes
+    control_every: int = 40
+    pull_ratio: float = 4.0
+    split_pixels: float = 1.5
+    least_mass_share: float = 0.02
+    #: stop when the best of so many steps is not better by this share
+    patience: int = 20
+    tolerance: float = 2e-3
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RefineOptions:
     """The Gaussian refinement."""
 
     #: ``tube`` (default), ``paper`` or ``none``
     refiner: str = "tube"
     tube: TubeOptions = dataclasses.field(default_factory=TubeOptions)
+    paper: PaperOptions = dataclasses.field(default_factory=PaperOptions)
     volume: VolumeOptions = dataclasses.field(default_factory=VolumeOptions)
 
 

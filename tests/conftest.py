@@ -14,3 +14,18 @@ def data_dir() -> Path:
     if not value or not Path(value).is_dir():
         pytest.skip("GCAR_DATA is not set to the folder with the optional data")
     return Path(value)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Benchmarks measure time, which a busy machine makes meaningless: only when asked for."""
+    parser.addoption("--run-benchmarks", action="store_true", help="run tests that measure time")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip benchmarks unless they are asked for."""
+    if config.getoption("--run-benchmarks"):
+        return
+    skip = pytest.mark.skip(reason="needs --run-benchmarks")
+    for item in items:
+        if "benchmark" in item.keywords:
+            item.add_marker(skip)

@@ -10,7 +10,7 @@ import onnxruntime as ort
 from gcar_deploy.errors import ModelError, NumericalError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict.candidates import Candidates
-from gcar_deploy.predict.encoding import LEVELS, Encoded
+from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
 from gcar_deploy.predict.model_spec import ModelFile
 
 
@@ -61,12 +61,7 @@ class CenterPredictor:
         CenterPoints
             All n points with confidence, radius and the offset to the expected centreline.
         """
-        names = ["features", "ray", "ray_path", "weight"]
-        arrays = [encoded.features, encoded.ray, encoded.ray_path, encoded.weight]
-        names += [f"neighbours{k}" for k in range(LEVELS + 1)]
-        names += [f"parent{k}" for k in range(LEVELS)]
-        arrays += [*encoded.neighbours, *encoded.parent]
-        feed = dict(zip(names, arrays, strict=True))
+        feed = dict(zip(input_names(), flat_inputs(encoded), strict=True))
         out = self._session.run(None, feed, run_options)[0]
         if out.shape != (len(candidates), 5) or not np.isfinite(out).all():
             raise NumericalError(f"model {self.model.name} returned values that are not finite")

@@ -37,6 +37,11 @@ class Encoded:
     weight : (V, n) float32, share of the ray's chord that one full cell accounts for, cells
     neighbours : per level (n_l, 27) int64, index into the level, n_l where there is none
     parent : per level but the last (n_l,) int64, index into the next level
+    members : (V, r, K) int64, the points behind each ray, padded with n
+    children : per level but the first (n_l, 8) int64, the cells inside, padded with n_(l-1)
+
+    ``members`` and ``children`` say what ``ray`` and ``parent`` say, the other way round: sums
+    over them are gathers with a fixed order, where scatters with repeated indices race.
     """
 
     features: Array
@@ -45,6 +50,8 @@ class Encoded:
     weight: Array
     neighbours: tuple[Array, ...]
     parent: tuple[Array, ...]
+    members: Array
+    children: tuple[Array, ...]
 
 
 def encode(candidates: Candidates, views: Sequence[tuple[CArm, Image, bool]]) -> Encoded:
@@ -65,14 +72,31 @@ def encode(candidates: Candidates, views: Sequence[tuple[CArm, Image, bool]]) ->
     for k, p in enumerate(per_view):
         ray_path[k, : len(p[2])] = p[2]
     neighbours, parent = _levels(candidates.index)
+    ray = np.stack([p[1] for p in per_view])
+    widest = max((int(np.bincount(r).max(initial=1)) for r in ray), default=1)
+    rays = ray_path.shape[1]
     return Encoded(
         features=np.stack([p[0] for p in per_view]),
-        ray=np.stack([p[1] for p in per_view]),
+        ray=ray,
         ray_path=ray_path,
         weight=np.stack([p[3] for p in per_view]),
         neighbours=neighbours,
         parent=parent,
+        members=np.stack([_inverted(r, rays, widest) for r in ray]),
+        children=tuple(
+            _inverted(p, len(n), 8) for p, n in zip(parent, neighbours[1:], strict=True)
+        ),
     )
+
+
+def _inverted(owner: Array, owners: int, width: int) -> Array:
+    """(owners, width) rows of what each owner owns, in order, padded with len(owner)."""
+    order = np.argsort(owner, kind="stable")
+    count = np.bincount(owner, minlength=owners)
+    first = np.cumsum(count) - count
+    out = np.full((owners, width), len(owner), np.int64)
+    out[owner[order], np.arange(len(owner)) - np.repeat(first, count)] = order
+    return out
 
 
 def _view_inputs(
@@ -151,3 +175,31 @@ def _neighbours(index: Array) -> Array:
         out[here, k] = there
         out[there, 26 - k] = here
     return out
+
+
+def input_names() -> list[str]:
+    """Names of the ONNX graph's inputs, in the order of ``flat_inputs``."""
+    return [
+        "features",
+        "ray",
+        "ray_path",
+        "weight",
+        *(f"neighbours{k}" for k in range(LEVELS + 1)),
+        *(f"parent{k}" for k in range(LEVELS)),
+        "members",
+        *(f"children{k}" for k in range(LEVELS)),
+    ]
+
+
+def flat_inputs(encoded: Encoded) -> list[Array]:
+    """Return the arrays of ``encoded`` in the order of ``input_names``."""
+    return [
+        encoded.features,
+        encoded.ray,
+        encoded.ray_path,
+        encoded.weight,
+        *encoded.neighbours,
+        *encoded.parent,
+        encoded.members,
+        *encoded.children,
+    ]

@@ -74,7 +74,7 @@ def read_model(path: Path) -> ModelFile:
     for key, value in wanted.items():
         if not isinstance(inputs, dict) or inputs.get(key) != value:
             raise ModelError(
-                f"model {path.name} wants inputs.{key} = {inputs.get(key)!r}, "
+                f"model {path.name} wants inputs.{key} = {dict(inputs or {}).get(key)!r}, "
                 f"this version gives {value}"
             )
     return ModelFile(name=str(spec.get("name", path.stem)), spec=spec, sha256=digest, data=data)

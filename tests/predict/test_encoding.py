@@ -51,6 +51,20 @@ def test_levels_lead_to_the_cell_that_holds_the_point():
         fine = coarse
 
 
+def test_members_and_children_are_rays_and_parents_inverted():
+    views = scene()
+    hull = visual_hull(views, GRID, CandidateOptions())
+    e = encode(hull, [(c, p, True) for c, p in views])
+    for k in range(2):
+        for r in range(0, e.ray_path.shape[1], 37):
+            inside = e.members[k, r][e.members[k, r] < len(hull)]
+            assert inside.tolist() == np.flatnonzero(e.ray[k] == r).tolist()
+    for parent, children in zip(e.parent, e.children, strict=True):
+        owner, column = np.nonzero(children < len(parent))
+        np.testing.assert_array_equal(parent[children[owner, column]], owner)
+        assert len(owner) == len(parent)
+
+
 def test_encoded_rays_carry_the_path_of_their_pixel():
     views = scene()
     hull = visual_hull(views, GRID, CandidateOptions())
