@@ -1,0 +1,117 @@
+"""Pose between two views from epipolar consistency alone, before there is any tree.
+
+Every plane through both sources cuts the same slice of vessel out of both pictures, so the
+vessel mass per plane must agree. A patient who moved between the runs, or an angle that was
+read off wrongly, shifts one profile against the other; the shift that makes them agree again
+is what the pictures can tell. What they cannot tell (motion within the planes) is held at zero
+by its prior.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from gcar_deploy.config import PoseOptions
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
+from gcar_deploy.geometry.epipolar import plane_normal
+from gcar_deploy.types import Array, Image
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pose:
+    """Correction of one view relative to the first.
+
+    Attributes
+    ----------
+    offset_mm : (3,) the patient moved by so much before this view, mm LPS
+    primary_deg, secondary_deg : float, correction of the angles
+    before, after : float
+        Disagreement of the two mass profiles, 0 (equal) .. 1 (nothing in common).
+    """
+
+    offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    primary_deg: float = 0.0
+    secondary_deg: float = 0.0
+    before: float = 0.0
+    after: float = 0.0
+
+    def applied(self, carm: CArm) -> CArm:
+        """Return the view with the correction built in."""
+        return _corrected(carm, np.array([*self.offset_mm, self.primary_deg, self.secondary_deg]))
+
+
+def estimate_poses(views: Sequence[tuple[CArm, Image]], options: PoseOptions) -> tuple[Pose, ...]:
+    """Estimate the correction of every view against the first.
+
+    Parameters
+    ----------
+    views : sequence of (CArm, path_mm)
+        Path lengths in any scale, zero outside vessels; some 128^2 pixels are enough.
+    options : PoseOptions
+
+    Returns
+    -------
+    tuple of Pose, the first of them zero
+    """
+    masses = [vessel_mass(carm, path) for carm, path in views]
+    return (Pose(), *(_estimate(masses[0], moving, options) for moving in masses[1:]))
+
+
+def _estimate(fixed: Mass | None, moving: Mass | None, options: PoseOptions) -> Pose:
+    if fixed is None or moving is None:
+        return Pose()
+    before = disagreement(fixed, moving, moving.carm, options.fine_mm)
+    if not options.enabled:
+        return Pose(before=before, after=before)
+    prior = np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+    normal = plane_normal(fixed.carm, moving.carm)
+    start, best = np.zeros(5), np.inf
+    for shift in np.arange(-options.search_mm, options.search_mm + 1e-9, options.step_mm):
+        theta = np.concatenate([shift * normal, np.zeros(2)])
+        r = _residuals(theta, fixed, moving, prior, options.coarse_mm, options)
+        if float(r @ r) < best:
+            start, best = theta, float(r @ r)
+    for sigma in (options.coarse_mm, options.fine_mm):
+        solution = least_squares(
+            _residuals,
+            start,
+            args=(fixed, moving, prior, sigma, options),
+            diff_step=1e-3,
+            x_scale=prior,
+            max_nfev=options.max_evaluations,
+        )
+        start = solution.x
+    after = disagreement(fixed, moving, _corrected(moving.carm, start), options.fine_mm)
+    if after > options.min_gain * before:
+        # Not clearly better than the geometry as given: leave it alone.
+        return Pose(before=before, after=before)
+    x, y, z, primary, secondary = (float(value) for value in start)
+    return Pose(
+        offset_mm=(x, y, z),
+        primary_deg=primary,
+        secondary_deg=secondary,
+        before=before,
+        after=after,
+    )
+
+
+def _residuals(
+    theta: Array, fixed: Mass, moving: Mass, prior: Array, sigma_mm: float, options: PoseOptions
+) -> Array:
+    a, b = mass_profiles(fixed, moving, _corrected(moving.carm, theta), sigma_mm)
+    scale = 1.0 / (options.profile_noise * np.sqrt(float(a @ a)))
+    return np.concatenate([(a - b) * scale, theta / prior])
+
+
+def _corrected(carm: CArm, theta: Array) -> CArm:
+    """``theta``: offset x, y, z in mm, primary and secondary angle in degrees."""
+    if not theta.any():
+        return carm
+    if theta[3] or theta[4]:
+        carm = carm.turned(float(theta[3]), float(theta[4]))
+    return carm.moved(theta[:3])

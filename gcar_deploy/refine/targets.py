@@ -1,0 +1,100 @@
+"""From vessel images to what the tube fit compares with: blurred and shrunk, level by level."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.types import Array, Image
+
+#: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
+COARSE_BLUR_PX = 0.6
+#: bounds of the contrast factor of a picture that is not calibrated.
+CONTRAST_BOUNDS = (0.4, 2.5)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Target:
+    """One view at one level.
+
+    Attributes
+    ----------
+    carm : CArm, of the picture's size
+    path_mm : (rows, cols) float64
+    weight : (rows, cols) 0 .. 1, 0 where the picture says nothing
+    sigma_mm : (rows, cols) noise of a mm^2 of picture
+    box_px : float, width of the averaging box in the model, pixels
+    pixel_mm : float, pixel edge at the isocentre
+    calibrated : bool
+    contrast : float, factor on the model, 1 for calibrated pictures
+    """
+
+    carm: CArm
+    path_mm: Image
+    weight: Array
+    sigma_mm: Array
+    box_px: float
+    pixel_mm: float
+    calibrated: bool = True
+    contrast: float = 1.0
+
+    def with_contrast(self, model: Image) -> Target:
+        """Fit the contrast factor to a model picture by least squares (variable projection)."""
+        if self.calibrated:
+            return self
+        w = self.weight / self.sigma_mm**2
+        power = float((w * model * model).sum())
+        if power <= 0:
+            return self
+        factor = float((w * model * self.path_mm).sum()) / power
+        return dataclasses.replace(self, contrast=float(np.clip(factor, *CONTRAST_BOUNDS)))
+
+
+def make_targets(
+    views: Sequence[VesselImage], level_mm: float, options: TubeOptions
+) -> list[Target]:
+    """Build the targets of one level.
+
+    Parameters
+    ----------
+    views : sequence of VesselImage
+    level_mm : float
+        Pixel wanted at the isocentre, mm; 0 for the picture's own.
+    options : TubeOptions
+    """
+    return [_target(view, level_mm, options) for view in views]
+
+
+def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
+    carm = view.carm
+    own = carm.pixel_at_isocenter_mm
+    factor = max(int(np.floor(level_mm / own + 1e-6)), 1) if level_mm else 1
+    path: Array = np.ascontiguousarray(view.path_mm, dtype=np.float32)
+    weight: Array = view.valid.astype(np.float32)
+    # Variances in pixels^2 of the working picture; a box of width b has b^2 / 12.
+    variance = (options.edge_blur_mm / (own * factor)) ** 2 / 12
+    if factor > 1:
+        size = (max(carm.columns // factor, 1), max(carm.rows // factor, 1))
+        path = cv2.resize(path, size, interpolation=cv2.INTER_AREA)
+        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        carm = carm.resized(size[1], size[0])
+        variance += (1 - 1 / factor**2) / 12
+    if level_mm:
+        path = cv2.GaussianBlur(path, (0, 0), COARSE_BLUR_PX)
+        variance += COARSE_BLUR_PX**2
+    share = options.noise_share if view.calibrated else options.noise_share_uncalibrated
+    return Target(
+        carm=carm,
+        path_mm=path.astype(np.float64),
+        weight=weight.astype(np.float64),
+        sigma_mm=options.noise_mm + share * path.astype(np.float64),
+        box_px=max(float(np.sqrt(12 * variance)), 0.05),
+        pixel_mm=carm.pixel_at_isocenter_mm,
+        calibrated=view.calibrated,
+    )

@@ -1,0 +1,179 @@
+"""The default refiner: settle the points, build the tree, fit it, cut and grow, state sigma."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gcar_deploy.config import TreeOptions, TubeOptions
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.refine.choose import chosen_tree
+from gcar_deploy.refine.settle import settled
+from gcar_deploy.refine.support import grown_tree, seen_share, supported_tree, unexplained
+from gcar_deploy.refine.targets import Target, make_targets
+from gcar_deploy.refine.tube import (
+    Progress,
+    fit_level,
+    footprints,
+    normal_equations,
+    rescaled,
+)
+from gcar_deploy.refine.tube_model import Tubes, tubes_of
+from gcar_deploy.refine.tube_prior import Prior, make_prior
+from gcar_deploy.refine.uncertainty import fit_sigma, geometry_sigma
+from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.tree import Tree
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TubeFit:
+    """Outcome of the tube refiner.
+
+    Attributes
+    ----------
+    tree : Tree with sigma per point; empty where nothing could be built
+    centers : CenterPoints the tree was built from
+    scatter_mm : float, estimated scatter of the starting points (0 on a lattice)
+    contrast : tuple of float, per view, factor of the picture's path on the model's
+    progress : Progress
+    """
+
+    tree: Tree
+    centers: CenterPoints
+    scatter_mm: float
+    contrast: tuple[float, ...]
+    progress: Progress
+
+
+def fit_tubes(
+    centers: CenterPoints,
+    views: Sequence[VesselImage],
+    options: TubeOptions,
+    tree_options: TreeOptions | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> TubeFit:
+    """Fit a tube tree to the pictures from starting points.
+
+    Parameters
+    ----------
+    centers : CenterPoints
+    views : sequence of VesselImage, one or more
+    options, tree_options : frozen options
+    should_stop : callable, asked before each step; True ends the fit with the best so far
+    """
+    progress = Progress()
+    settled_centers, scatter = settled(centers, [(view.carm, view.path_mm) for view in views])
+    tree = build_tree(settled_centers, tree_options)
+    contrast = (1.0,) * len(views)
+    if tree.branches:
+        tree, contrast = _fitted(tree, views, options, progress, should_stop)
+    return TubeFit(
+        tree=tree,
+        centers=settled_centers,
+        scatter_mm=scatter,
+        contrast=contrast,
+        progress=progress,
+    )
+
+
+def _fitted(
+    tree: Tree,
+    views: Sequence[VesselImage],
+    options: TubeOptions,
+    progress: Progress,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[Tree, tuple[float, ...]]:
+    targets: list[Target] = []
+    start_radius = tree.radii()
+    tubes, prior = _start(tree, options)
+    for number, (level, steps) in enumerate(zip(options.levels_mm, options.steps, strict=True)):
+        if progress.stopped or progress.failed:
+            break
+        targets = _contrasts(make_targets(views, level, options), targets)
+        tubes = fit_level(tubes, targets, prior, options, steps, progress, should_stop)
+        tree = tree_of(tubes, tree)
+        if number or len(options.levels_mm) == 1:
+            continue
+        if options.min_share > 0:
+            seen = rescaled(targets, footprints(tubes, targets))
+            tree = chosen_tree(tree, start_radius, seen, options)
+            tree, tubes, prior = _refit(tree, targets, options, steps // 2, progress, should_stop)
+        if tree.branches:
+            tree = _supported(tree, tubes, targets, options)
+            tree, tubes, prior = _refit(tree, targets, options, steps // 2, progress, should_stop)
+        if not tree.branches:
+            return tree, tuple(target.contrast for target in targets)
+    targets = rescaled(targets, footprints(tubes, targets))
+    tree = with_sigma(tree, tubes, targets, prior, options)
+    return tree, tuple(target.contrast for target in targets)
+
+
+def _start(tree: Tree, options: TubeOptions) -> tuple[Tubes, Prior]:
+    tubes = tubes_of(tree)
+    trust = np.concatenate([np.zeros(0), *(branch.confidence for branch in tree.branches)])
+    return tubes, make_prior(tubes, trust, options)
+
+
+def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
+    if not before:
+        return targets
+    return [
+        dataclasses.replace(new, contrast=old.contrast)
+        for new, old in zip(targets, before, strict=True)
+    ]
+
+
+def _refit(
+    tree: Tree,
+    targets: list[Target],
+    options: TubeOptions,
+    steps: int,
+    progress: Progress,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[Tree, Tubes, Prior]:
+    """Fit again after the topology changed, from where the tree is now."""
+    tubes, prior = _start(tree, options)
+    if tree.branches:
+        tubes = fit_level(tubes, targets, prior, options, steps, progress, should_stop)
+    return tree_of(tubes, tree), tubes, prior
+
+
+def _supported(tree: Tree, tubes: Tubes, targets: list[Target], options: TubeOptions) -> Tree:
+    """Cut what the pictures do not show, then grow along what the tree does not explain."""
+    prints = footprints(tubes, targets)
+    targets = rescaled(targets, prints)
+    tree = supported_tree(tree, tubes, seen_share(tubes, targets, prints), options)
+    if not tree.branches or options.max_growth_mm <= 0:
+        return tree
+    left = unexplained(targets, footprints(tubes_of(tree), targets))
+    return grown_tree(tree, targets, left, options)
+
+
+def tree_of(tubes: Tubes, tree: Tree) -> Tree:
+    """Return ``tree`` with the positions and radii of ``tubes``, which was made from it."""
+    points, radii = tubes.points_mm, tubes.radius_mm
+    branches = []
+    for k, branch in enumerate(tree.branches):
+        own = tubes.point_branch == k
+        branches.append(dataclasses.replace(branch, points_mm=points[own], radius_mm=radii[own]))
+    nodes = tubes.positions_mm[: len(tree.nodes_mm)]
+    return dataclasses.replace(tree, nodes_mm=nodes, branches=tuple(branches))
+
+
+def with_sigma(
+    tree: Tree, tubes: Tubes, targets: list[Target], prior: Prior, options: TubeOptions
+) -> Tree:
+    """Return the tree with sigma per point: fit and geometry prior, in quadrature."""
+    prints = footprints(tubes, targets)
+    hessian, _ = normal_equations(tubes, targets, prints, prior, options)
+    own = fit_sigma(hessian, tubes.owner, len(tubes.positions_mm))[tubes.owner]
+    geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets], options)
+    sigma = np.sqrt(own**2 + geometry**2)
+    branches = [
+        dataclasses.replace(branch, sigma_mm=sigma[tubes.point_branch == k])
+        for k, branch in enumerate(tree.branches)
+    ]
+    return dataclasses.replace(tree, branches=tuple(branches))

@@ -1,0 +1,93 @@
+"""What is known of vessels before the pictures: they bend and taper slowly, near the start."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import sparse
+
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.refine.tube_model import Tubes
+from gcar_deploy.types import Scalars
+
+#: confidence below which a starting point still holds a little.
+LEAST_TRUST = 0.05
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Prior:
+    """Quadratic prior 0.5 |A x - b|^2 over the unknowns, ``hessian`` = A^T A."""
+
+    A: sparse.csr_matrix
+    b: Scalars
+    hessian: sparse.csc_matrix
+
+    def value(self, x: Scalars) -> float:
+        """Half the squared norm."""
+        r = self.A @ x - self.b
+        return 0.5 * float(r @ r)
+
+    def gradient(self, x: Scalars) -> Scalars:
+        """A^T (A x - b)."""
+        out: Scalars = self.A.T @ (self.A @ x - self.b)
+        return out
+
+
+def make_prior(tubes: Tubes, trust: Scalars, options: TubeOptions) -> Prior:
+    """Bending, taper and anchors of a tree at its start, per mm of centreline.
+
+    Parameters
+    ----------
+    tubes : Tubes at the start
+    trust : (n,) 0 .. 1, confidence in each branch point
+    options : TubeOptions
+    """
+    p, n = len(tubes.positions_mm), len(tubes.log_radius)
+    points = tubes.points_mm
+    gap = np.maximum(np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1), 1e-3)
+    own = np.bincount(tubes.first, 0.5 * gap, n) + np.bincount(tubes.second, 0.5 * gap, n)
+    bend = _bending(tubes, gap, options.bend)
+    taper = _taper(tubes, gap, options.taper)
+    weight = np.bincount(tubes.owner, own * np.maximum(trust, LEAST_TRUST), p)
+    hold = np.concatenate(
+        [
+            np.repeat(np.sqrt(weight) / options.anchor_mm, 3),
+            np.sqrt(own) / options.anchor_log_radius,
+        ]
+    )
+    start = np.concatenate([tubes.positions_mm.reshape(-1), tubes.log_radius])
+    A = sparse.vstack(
+        [
+            sparse.hstack(
+                [sparse.kron(bend, sparse.eye(3)), sparse.csr_matrix((3 * bend.shape[0], n))]
+            ),
+            sparse.hstack([sparse.csr_matrix((len(gap), 3 * p)), taper]),
+            sparse.diags(hold),
+        ]
+    ).tocsr()
+    b = np.concatenate([np.zeros(3 * bend.shape[0] + len(gap)), hold * start])
+    return Prior(A, b, (A.T @ A).tocsc())
+
+
+def _taper(tubes: Tubes, gap: Scalars, taper: float) -> sparse.csr_matrix:
+    """(s, n) steps of the log radius, scaled to a random walk."""
+    w = 1.0 / (taper * np.sqrt(gap))
+    row = np.tile(np.arange(len(gap)), 2)
+    column = np.concatenate([tubes.first, tubes.second])
+    return sparse.csr_matrix(
+        (np.concatenate([w, -w]), (row, column)), shape=(len(gap), len(tubes.log_radius))
+    )
+
+
+def _bending(tubes: Tubes, gap: Scalars, bend: float) -> sparse.csr_matrix:
+    """(m, p) second differences along the branches, scaled to a random walk of direction."""
+    k = np.flatnonzero(tubes.second[:-1] == tubes.first[1:])
+    a, b, c = (tubes.owner[x] for x in (tubes.first[k], tubes.second[k], tubes.second[k + 1]))
+    left, right = gap[k], gap[k + 1]
+    scale = 1.0 / (bend * np.sqrt(0.5 * (left + right)))
+    value = np.concatenate([scale / left, -scale * (1 / left + 1 / right), scale / right])
+    row = np.tile(np.arange(len(k)), 3)
+    return sparse.csr_matrix(
+        (value, (row, np.concatenate([a, b, c]))), shape=(len(k), len(tubes.positions_mm))
+    )

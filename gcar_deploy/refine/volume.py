@@ -1,0 +1,275 @@
+"""From the fitted tubes to voxels, corrected by what pictures and starting points still say.
+
+Sections of real vessels are not round. Near the tubes' surface the occupancy x of each voxel is
+a Gaussian variable about the tubes' x0, correlated over about a voxel along the vessel:
+
+    x = x0 + G z,  z ~ N(0, 1),
+    pictures: A x = path + noise,   starting points: K x = density + noise
+
+(A the voxel projector, K the blur of points that scatter). The most probable z solves
+(1 + G^T O^T R^-1 O G) z = G^T O^T R^-1 e, by conjugate gradients on some thousands of voxels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import LinearOperator, cg
+from scipy.spatial import cKDTree
+
+from gcar_deploy.config import VolumeOptions
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.refine.settle import scatter_is_none
+from gcar_deploy.refine.splat import cell_view, shrunk
+from gcar_deploy.refine.tube_model import footprint, tubes_of
+from gcar_deploy.tree.occupancy import tree_occupancy
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Array, Points, Scalars, Volume
+
+#: voxels are free where the slightly blurred tubes reach this occupancy.
+BAND = 0.02
+BAND_BLUR = 0.6
+#: neighbours within this many voxels are correlated, and take part in the points' blur.
+REACH = 2
+#: the projector needs voxels about as wide as they are deep.
+MAX_ANISOTROPY = 1.01
+#: points stand for voxels where their spacing is the voxel's to this factor.
+SAME_SPACING = 1.2
+#: error of round tubes at their surface, which the points' own noise comes on top of.
+TUBE_ERROR = 0.18
+#: what a predictor gets wrong beyond that it gets wrong for whole stretches, not voxel by voxel:
+#: its excess variance counts so many times.
+BIAS_WEIGHT = 12.0
+CG_STEPS = 40
+CG_TOLERANCE = 2e-2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Band:
+    """Free voxels: (n, 3) index, (n, 3) mm, prior mean and sigma, (pairs) of neighbours."""
+
+    index: Array
+    points_mm: Points
+    mean: Scalars
+    sigma: Scalars
+    row: Array
+    col: Array
+    step: Array
+
+
+def tube_volume(
+    tree: Tree,
+    grid: Grid,
+    views: Sequence[VesselImage],
+    contrast: Sequence[float],
+    centers: CenterPoints | None,
+    edge_blur_mm: float,
+    options: VolumeOptions,
+) -> Volume:
+    """Occupancy of each voxel, 0 .. 1.
+
+    Parameters
+    ----------
+    tree : fitted Tree
+    grid : Grid wanted
+    views : the pictures the tree was fitted to
+    contrast : per view, factor of the picture's path on the model's
+    centers : the points the fit started from, or None
+    edge_blur_mm : as in the fit
+    options : VolumeOptions
+
+    Returns
+    -------
+    (nx, ny, nz) float32
+    """
+    volume = tree_occupancy(tree, grid)
+    spacing = grid.spacing_mm
+    if not options.fuse or not tree.branches or spacing.max() / spacing.min() > MAX_ANISOTROPY:
+        return volume
+    blurred = ndimage.gaussian_filter(volume, BAND_BLUR, truncate=3.0)
+    if np.count_nonzero(blurred > BAND) > options.max_cells:
+        return volume
+    band = _band(volume, blurred, grid, options)
+    if not len(band.index):
+        return volume
+    G = _correlation(band, tree, options)
+    operators, errors, variances = _pictures(
+        band, tree, grid, views, contrast, edge_blur_mm, options
+    )
+    if centers is not None and len(centers):
+        told = _points(band, tree, grid, centers, options)
+        if told is not None:
+            operators.append(told[0])
+            errors.append(told[1])
+            variances.append(told[2])
+    if not operators:
+        return volume
+    change = _solve(
+        G, sparse.vstack(operators).tocsr(), np.concatenate(errors), np.concatenate(variances)
+    )
+    volume[tuple(band.index.T)] = np.clip(band.mean + change, 0.0, 1.0)
+    return volume
+
+
+def _band(volume: Volume, blurred: Array, grid: Grid, options: VolumeOptions) -> _Band:
+    near = blurred > BAND
+    index = np.argwhere(near)
+    lookup = np.full(np.asarray(near.shape) + 2 * REACH, -1, np.int64)
+    lookup[tuple((index + REACH).T)] = np.arange(len(index))
+    span = np.arange(-REACH, REACH + 1)
+    offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
+    offsets = offsets[np.linalg.norm(offsets, axis=1) <= REACH]
+    found = [lookup[tuple((index + REACH + offset).T)] for offset in offsets]
+    ok = np.stack(found) >= 0
+    which, row = np.nonzero(ok)
+    half = np.clip(blurred[near].astype(np.float64), 0.0, 1.0)
+    sigma2 = options.floor_sigma**2 + options.surface_sigma**2 * 4 * half * (1 - half)
+    return _Band(
+        index=index,
+        points_mm=grid.index2world(index),
+        mean=volume[near].astype(np.float64),
+        sigma=np.sqrt(sigma2),
+        row=row,
+        col=np.stack(found)[ok],
+        step=offsets[which],
+    )
+
+
+def _correlation(band: _Band, tree: Tree, options: VolumeOptions) -> sparse.csr_matrix:
+    """G with G G^T the prior covariance: Gaussian along and across the nearest vessel."""
+    tangents = np.concatenate([branch.tangents for branch in tree.branches])
+    nearest = cKDTree(tree.points()).query(band.points_mm)[1]
+    tangent = tangents[nearest][band.row]
+    along = np.einsum("ij,ij->i", band.step, tangent)
+    across2 = np.maximum(np.einsum("ij,ij->i", band.step, band.step) - along**2, 0.0)
+    weight = np.exp(
+        -0.5 * ((along / options.along_voxels) ** 2 + across2 / options.across_voxels**2)
+    )
+    power = np.sqrt(np.bincount(band.row, weight**2, minlength=len(band.index)))
+    weight *= (band.sigma / power)[band.row]
+    n = len(band.index)
+    return sparse.csr_matrix((weight, (band.row, band.col)), shape=(n, n))
+
+
+def _pictures(
+    band: _Band,
+    tree: Tree,
+    grid: Grid,
+    views: Sequence[VesselImage],
+    contrast: Sequence[float],
+    edge_blur_mm: float,
+    options: VolumeOptions,
+) -> tuple[list[sparse.csr_matrix], list[Scalars], list[Scalars]]:
+    """Projector, path that the tubes leave unexplained, and its variance, per view."""
+    tubes = tubes_of(tree)
+    h = float(grid.spacing_mm.mean())
+    operators, errors, variances = [], [], []
+    for view, factor in zip(views, contrast, strict=True):
+        if not view.calibrated:
+            continue
+        box = max(edge_blur_mm / view.carm.pixel_at_isocenter_mm, 0.05)
+        model = footprint(tubes, view.carm, box).image(view.path_mm.shape)
+        rest = np.where(view.valid, view.path_mm / factor - model, 0.0)
+        cells = cell_view(view.carm, view.path_mm, band.points_mm, h)
+        rest = shrunk(view.carm, rest.astype(np.float32), h)[1]
+        operators.append(cells.matrix)
+        errors.append(rest.reshape(-1)[cells.pixel].astype(np.float64))
+        path = cells.path_mm.reshape(-1)[cells.pixel]
+        variances.append((options.noise_mm + options.noise_share * path) ** 2)
+    return operators, errors, variances
+
+
+def _points(
+    band: _Band, tree: Tree, grid: Grid, centers: CenterPoints, options: VolumeOptions
+) -> tuple[sparse.csr_matrix, Scalars, Scalars] | None:
+    """Read what the starting points say of the voxels; None where they are too coarse."""
+    h = float(grid.spacing_mm.mean())
+    ratio = centers.spacing_mm / h
+    if not 1 / SAME_SPACING < ratio < SAME_SPACING:
+        return None
+    density = _deposited(centers, grid)[tuple(band.index.T)] * ratio**3
+    n = len(band.index)
+    at = grid.world2index(centers.points_mm)
+    if scatter_is_none(centers) and np.abs(at - np.rint(at)).max() < 0.02:
+        error = density - band.mean
+        rim = band.sigma > 0.5 * options.surface_sigma
+        spread = float(np.mean(error[rim] ** 2)) if rim.any() else 0.0
+        excess = max(spread - TUBE_ERROR**2, 0.0)
+        noise = options.confidence_sigma**2 + BIAS_WEIGHT * excess
+        return sparse.eye(n, format="csr"), error, np.full(n, noise)
+    sigma = scatter_voxels(tree, centers)
+    if sigma > options.max_scatter_voxels:
+        return None
+    # Trilinear deposit adds the variance of its tent, 1/6.
+    width2 = sigma**2 + 1 / 6
+    weight = np.exp(-0.5 * np.einsum("ij,ij->i", band.step, band.step) / width2)
+    offsets = np.unique(band.step, axis=0)
+    whole = np.exp(-0.5 * np.einsum("ij,ij->i", offsets, offsets) / width2).sum()
+    K = sparse.csr_matrix((weight / whole, (band.row, band.col)), shape=(n, n))
+    expected = K @ band.mean
+    # Dropped points lower the whole density: compare shapes only.
+    scale = float(density.sum() / max(expected.sum(), 1e-9))
+    variance = 0.01 + options.scatter_variance * np.maximum(expected, 0.02)
+    return K, density / max(scale, 1e-9) - expected, variance
+
+
+def _deposited(centers: CenterPoints, grid: Grid) -> Array:
+    """(nx, ny, nz) confidence deposited on the voxels, trilinear."""
+    at = grid.world2index(centers.points_mm)
+    at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
+    base = np.floor(at).astype(np.int64)
+    share = at - base
+    out = np.zeros(int(np.prod(grid.shape)))
+    for corner in np.ndindex(2, 2, 2):
+        index = base + corner
+        weight = centers.confidence * np.where(corner, share, 1 - share).prod(axis=1)
+        ok = ((index >= 0) & (index < grid.shape)).all(axis=1) & (weight > 0)
+        flat = np.ravel_multi_index(tuple(index[ok].T), grid.shape)
+        out += np.bincount(flat, weight[ok], minlength=len(out))
+    return out.reshape(grid.shape)
+
+
+def scatter_voxels(tree: Tree, centers: CenterPoints) -> float:
+    """Scatter of the points about the tubes, in point spacings: excess of their second moment.
+
+    A round section of radius r has mean squared distance r^2 / 2 from its axis; each cell adds
+    h^2 / 6 across, a scatter sigma adds 2 sigma^2.
+    """
+    h = centers.spacing_mm
+    distance, nearest = cKDTree(tree.points()).query(centers.points_mm)
+    radius = tree.radii()[nearest]
+    near = distance < radius + 3 * h
+    weight = centers.confidence * near
+    if weight.sum() <= 0:
+        return np.inf
+    excess = float((weight * (distance**2 - 0.5 * radius**2)).sum() / weight.sum())
+    return float(np.sqrt(max(0.5 * (excess - h * h / 6), 0.0))) / h
+
+
+def _solve(
+    G: sparse.csr_matrix,
+    O: sparse.csr_matrix,
+    error: Scalars,
+    variance: Scalars,
+) -> Scalars:
+    inverse = 1.0 / variance
+    GT, OT = G.T.tocsr(), O.T.tocsr()
+
+    def apply(z: Scalars) -> Scalars:
+        out: Scalars = z + GT @ (OT @ (inverse * (O @ (G @ z))))
+        return out
+
+    n = G.shape[0]
+    z, _ = cg(
+        LinearOperator((n, n), matvec=apply, dtype=np.float64),
+        GT @ (OT @ (inverse * error)),
+        rtol=CG_TOLERANCE,
+        maxiter=CG_STEPS,
+    )
+    change: Scalars = G @ z
+    return change

@@ -1,0 +1,101 @@
+"""Stopwatch of one reconstruction: seconds per stage, progress, deadline, cancel."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from gcar_deploy.errors import CancelledError
+
+_log = logging.getLogger(__name__)
+
+#: called with (stage, share of the whole work done, 0 .. 1)
+OnProgress = Callable[[str, float], None]
+
+
+class Stopwatch:
+    """Times the stages of one reconstruction and says when to stop.
+
+    Parameters
+    ----------
+    shares : sequence of (stage, weight)
+        Every stage in order with its usual share of the time, for the progress.
+    on_progress : callable (stage, fraction), optional
+    deadline_s : float, optional
+        Seconds from now after which ``should_stop`` is true.
+    cancel : callable () -> bool, optional
+    """
+
+    def __init__(
+        self,
+        shares: Sequence[tuple[str, float]],
+        *,
+        on_progress: OnProgress | None = None,
+        deadline_s: float | None = None,
+        cancel: Callable[[], bool] | None = None,
+    ) -> None:
+        self.seconds: dict[str, float] = {}
+        self._started = time.perf_counter()
+        self._deadline_s = deadline_s
+        self._cancel = cancel
+        self._on_progress = on_progress
+        total = sum(weight for _, weight in shares) or 1.0
+        done = 0.0
+        self._span: dict[str, tuple[float, float]] = {}
+        for stage, weight in shares:
+            self._span[stage] = (done / total, (done + weight) / total)
+            done += weight
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._started
+
+    @property
+    def late(self) -> bool:
+        """Whether the deadline has passed."""
+        return self._deadline_s is not None and self.elapsed_s > self._deadline_s
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether the caller wants out."""
+        return self._cancel is not None and self._cancel()
+
+    def should_stop(self) -> bool:
+        """Whether an iteration should end with what it has."""
+        return self.late or self.cancelled
+
+    def check(self) -> None:
+        """Raise CancelledError if cancelled, or late; for stages without a usable half-result."""
+        if self.cancelled:
+            raise CancelledError("cancelled by the caller")
+        if self.late:
+            raise CancelledError(
+                f"the deadline of {self._deadline_s:g} s passed before there was a result"
+            )
+
+    @contextlib.contextmanager
+    def stage(self, name: str, *, keep_if_late: bool = False) -> Iterator[Callable[[float], None]]:
+        """Time a stage; yields a function that reports its own progress, 0 .. 1.
+
+        Raises
+        ------
+        CancelledError
+            Before the stage: cancelled, or late unless ``keep_if_late``.
+        """
+        if self.cancelled or not keep_if_late:
+            self.check()
+        low, high = self._span.get(name, (0.0, 0.0))
+
+        def report(share: float) -> None:
+            if self._on_progress is not None:
+                self._on_progress(name, low + (high - low) * min(max(share, 0.0), 1.0))
+
+        report(0.0)
+        start = time.perf_counter()
+        yield report
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        _log.debug("%s: %.3f s", name, self.seconds[name])
+        report(1.0)

@@ -1,0 +1,91 @@
+"""Change a tree's topology: drop branches, cut and lengthen ends, merge what no longer forks."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.types import Array
+
+
+def kept_branches(tree: Tree, keep: Array) -> Tree:
+    """Keep some branches, (b,) bool; nodes with two ends left become inner points."""
+    branches = tuple(b for b, k in zip(tree.branches, keep, strict=True) if k)
+    return merged(dataclasses.replace(tree, branches=branches))
+
+
+def merged(tree: Tree) -> Tree:
+    """Join branches that meet two at a node, and renumber the nodes that are left."""
+    branches = list(tree.branches)
+    ends: dict[int, list[int]] = {}
+    for i, branch in enumerate(branches):
+        ends.setdefault(branch.start, []).append(i)
+        ends.setdefault(branch.end, []).append(i)
+    alive = [True] * len(branches)
+    for node in sorted(ends):
+        pair = ends[node]
+        if len(pair) != 2 or pair[0] == pair[1]:
+            continue
+        i, j = sorted(pair)
+        first, second = branches[i], branches[j]
+        first = first if first.end == node else reversed_branch(first)
+        second = second if second.start == node else reversed_branch(second)
+        branches[i] = _concatenated(first, second)
+        alive[j] = False
+        far = second.end
+        ends[far] = [i if k == j else k for k in ends[far]]
+        ends[node] = []
+    left = [b for b, a in zip(branches, alive, strict=True) if a]
+    used = sorted({n for b in left for n in (b.start, b.end)})
+    number = {n: k for k, n in enumerate(used)}
+    left = [dataclasses.replace(b, start=number[b.start], end=number[b.end]) for b in left]
+    nodes = tree.nodes_mm[np.array(used, dtype=np.int64)] if used else np.zeros((0, 3))
+    return Tree(nodes_mm=nodes, branches=tuple(left))
+
+
+def reversed_branch(branch: Branch) -> Branch:
+    """Return the branch run the other way."""
+    return Branch(
+        points_mm=branch.points_mm[::-1],
+        radius_mm=branch.radius_mm[::-1],
+        sigma_mm=branch.sigma_mm[::-1],
+        confidence=branch.confidence[::-1],
+        start=branch.end,
+        end=branch.start,
+    )
+
+
+def part_of(branch: Branch, first: int, last: int) -> Branch:
+    """Points ``first`` to ``last`` (inclusive) of a branch; its node numbers are kept."""
+    cut = slice(first, last + 1)
+    return dataclasses.replace(
+        branch,
+        points_mm=branch.points_mm[cut],
+        radius_mm=branch.radius_mm[cut],
+        sigma_mm=branch.sigma_mm[cut],
+        confidence=branch.confidence[cut],
+    )
+
+
+def with_ends_moved(tree: Tree) -> Tree:
+    """Set each free end's node to where its branch ends now."""
+    nodes = tree.nodes_mm.copy()
+    degrees = tree.degrees
+    for branch in tree.branches:
+        for node, point in (
+            (branch.start, branch.points_mm[0]),
+            (branch.end, branch.points_mm[-1]),
+        ):
+            if degrees[node] == 1:
+                nodes[node] = point
+    return dataclasses.replace(tree, nodes_mm=nodes)
+
+
+def _concatenated(first: Branch, second: Branch) -> Branch:
+    parts = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)[1:]])
+        for name in ("points_mm", "radius_mm", "sigma_mm", "confidence")
+    }
+    return Branch(**parts, start=first.start, end=second.end)
