@@ -1,0 +1,94 @@
+"""gcar info RESULT_DIR: what a result folder is, and whether it is still what was written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+#: a result.json is some tens of kilobytes
+_MAX_BYTES = 16 * 2**20
+
+
+@click.command("info")
+@click.argument("path", type=click.Path(path_type=Path), metavar="RESULT_DIR")
+@click.option("--json", "as_json", is_flag=True, help="Print the content as one JSON object.")
+def info(path: Path, as_json: bool) -> None:
+    """Print what a result folder holds, and check its files against their hashes.
+
+    \b
+    Example:
+      gcar info result
+    """  # noqa: D301 - click wants a real backspace
+    from gcar_deploy.errors import UsageError
+
+    summary = read_result(path)
+    altered = altered_files(path, summary)
+    if as_json:
+        click.echo(json.dumps({**summary, "altered": altered}, allow_nan=False))
+    else:
+        click.echo("\n".join(lines(path, summary)))
+    if altered:
+        raise UsageError(f"{path}: not as it was written: {', '.join(altered)}")
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Read the result.json of a folder.
+
+    Raises
+    ------
+    UsageError
+        There is none, or it is not of schema gcar-result/1.
+    """
+    from gcar_deploy.errors import UsageError
+
+    file = path / "result.json" if path.is_dir() else path
+    try:
+        if file.stat().st_size > _MAX_BYTES:
+            raise ValueError("too large")
+        summary = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError):
+        raise UsageError(f"{file} is not a result.json") from None
+    if not isinstance(summary, dict) or summary.get("schema") != "gcar-result/1":
+        raise UsageError(f"{file} is not of schema gcar-result/1")
+    return summary
+
+
+def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:
+    """Names of the listed files that are missing or have another SHA-256."""
+    import hashlib
+
+    if not folder.is_dir():
+        return []
+    out = []
+    for name, entry in summary.get("files", {}).items():
+        file = folder / Path(name).name
+        if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != entry["sha256"]:
+            out.append(name)
+    return out
+
+
+def lines(path: Path, summary: dict[str, Any]) -> list[str]:
+    """Return the summary for people."""
+    tree, counts = summary["tree"], summary["counts"]
+    model = summary["model"]
+    out = [
+        f"{path}: {summary['status']}",
+        f"  {summary['sentence']}",
+        f"  tree: {len(tree['branches'])} branches, {tree['length_mm']:.0f} mm, "
+        f"{counts['gaussians']} Gaussians",
+        f"  made by: {summary['predictor']} + {summary['refiner']}, model "
+        + ("none" if model is None else f"{model['name']} {model['sha256'][:12]}")
+        + f", gcar {summary['versions'].get('gcar')}",
+        f"  views {summary['separation_deg']:.1f} deg apart; {summary['seconds']['total']:.2f} s",
+    ]
+    for view in summary["views"]:
+        coverage = "-" if view["coverage"] is None else f"{view['coverage']:.0%}"
+        out.append(f"  view {view['id']} ({view['name']}): {coverage} of the vessels explained")
+    out.append(f"  files: {', '.join(summary.get('files', {}))}")
+    out.append(f"  {summary['use']}")
+    return out

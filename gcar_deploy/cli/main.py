@@ -1,0 +1,117 @@
+"""gcar: the command group; verbs are imported when they are called, errors become one line."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import signal
+import sys
+from types import FrameType
+from typing import Any, NoReturn
+
+import click
+
+#: verb -> (module, what ``gcar --help`` says of it); kept here so that help imports nothing.
+VERBS = {
+    "run": ("gcar_deploy.cli.run", "Reconstruct a coronary tree from two or more pictures."),
+    "validate": ("gcar_deploy.cli.validate", "Check pictures and geometry; reconstruct nothing."),
+    "enhance": ("gcar_deploy.cli.enhance", "Show the steps of finding vessels in one picture."),
+    "demo": ("gcar_deploy.cli.demo", "Reconstruct the case that comes along."),
+    "doctor": ("gcar_deploy.cli.doctor", "Check this installation."),
+    "info": ("gcar_deploy.cli.info", "Print what a result folder or a model is."),
+}
+INTERRUPTED, TERMINATED, INTERNAL = 130, 143, 1
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived; raised so that unfinished folders are taken away."""
+
+
+class LazyGroup(click.Group):
+    """Group whose verbs live in modules of their own."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the verbs in the order of a session."""
+        return list(VERBS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the verb."""
+        if cmd_name not in VERBS:
+            return None
+        module, _ = VERBS[cmd_name]
+        command: click.Command = getattr(importlib.import_module(module), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the verbs without importing them."""
+        with formatter.section("Verbs"):
+            formatter.write_dl([(name, help_line) for name, (_, help_line) in VERBS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="gcar", prog_name="gcar")
+def gcar() -> None:
+    """Coronary arteries in 3D from two X-ray angiograms. Research use only.
+
+    \b
+    Example:
+      gcar run view1.png view2.png --geom geom.json --out result
+    """  # noqa: D301 - click wants a real backspace
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:
+    raise Terminated
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command and leave with the exit code of the contract."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    verbose = "-v" in arguments or "--verbose" in arguments
+    previous = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = _run(arguments, verbose)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    sys.exit(code)
+
+
+def _run(arguments: list[str], verbose: bool) -> int:
+    from gcar_deploy.errors import GcarError
+
+    try:
+        out: Any = gcar.main(arguments, prog_name="gcar", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return error.exit_code
+    except click.ClickException as error:
+        return _fail(error.format_message(), error.exit_code)
+    except GcarError as error:
+        return _fail(str(error), error.exit_code)
+    except (KeyboardInterrupt, click.Abort):
+        return _fail("interrupted", INTERRUPTED)
+    except Terminated:
+        return _fail("terminated", TERMINATED)
+    except BrokenPipeError:
+        # The reader of stdout went away; keep Python from complaining once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return INTERNAL
+    except MemoryError:
+        return _fail("out of memory; use a smaller volume or smaller pictures", INTERNAL)
+    except Exception as error:
+        # The last line of defence: never a traceback.
+        if verbose:
+            logging.getLogger("gcar_deploy").exception("internal error")
+        detail = str(error).splitlines()[0] if str(error) else ""
+        return _fail(f"internal error: {type(error).__name__} {detail}; see -v".strip(), INTERNAL)
+    return out if isinstance(out, int) else 0
+
+
+def _fail(message: str, code: int) -> int:
+    line = " ".join(message.split())
+    click.echo(f"gcar: error: {line}", err=True)
+    return code
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""gcar run VIEW1 VIEW2 ... --geom geom.json --out DIR."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gcar_deploy.cli.common import (
+    ProgressBar,
+    engine_options,
+    limit_threads,
+    output_options,
+    refusals_as_json,
+    run_options,
+    set_up_logging,
+)
+
+
+@click.command("run")
+@click.argument(
+    "views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 [VIEW3 ...]"
+)
+@click.option(
+    "--geom", required=True, type=click.Path(path_type=Path), help="Geometry of the views (JSON)."
+)
+@click.option(
+    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
+)
+@engine_options
+@click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
+@click.option("--force", is_flag=True, help="Replace an existing folder.")
+@output_options
+def run(
+    views: tuple[Path, ...],
+    geom: Path,
+    out_dir: Path,
+    predictor: str,
+    model: str | None,
+    refiner: str,
+    deadline: float | None,
+    threads: int | None,
+    strict: bool,
+    force: bool,
+    verbose: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Reconstruct a coronary tree from two or more pictures (PNG, TIFF, NPY).
+
+    Pictures stand in the order of the views in the geometry file.
+
+    \b
+    Example:
+      gcar run view1.png view2.png --geom geom.json --out result
+    """  # noqa: D301 - click wants a real backspace
+    from gcar_deploy.errors import RefusedError, UsageError
+
+    set_up_logging(verbose, quiet)
+    if len(views) < 2:
+        raise UsageError(f"{len(views)} picture given; gcar run needs two or more")
+    limit_threads(threads)
+    from gcar_deploy.output.folder import check_target
+
+    check_target(out_dir, force=force, inputs=(*views, geom))
+    from gcar_deploy.engine import Engine
+
+    engine = Engine(model, threads=threads, options=run_options(predictor, refiner))
+    with refusals_as_json(as_json), ProgressBar(quiet=quiet) as bar:
+        result = engine.reconstruct(list(views), geom, on_progress=bar, deadline_s=deadline)
+    for note in () if quiet else result.notes:
+        click.echo(f"gcar: {note}", err=True)
+    if strict and result.status != "ok":
+        with refusals_as_json(as_json):
+            raise RefusedError(f"degraded, and --strict was given: {result.quality.sentence}")
+    result.save(out_dir, force=force)
+    if as_json:
+        click.echo(json.dumps({"out": str(out_dir), **result.summary()}, allow_nan=False))
+    else:
+        click.echo("\n".join(summary_lines(result, out_dir)))
+
+
+def summary_lines(result: Any, out_dir: Path) -> list[str]:
+    """Return the path first, then a few lines for people."""
+    tree = result.tree
+    lines = [str(out_dir), f"{result.status}: {result.quality.sentence}"]
+    lines.append(
+        f"{len(tree.branches)} branches, {tree.length_mm:.0f} mm, "
+        f"{len(result.gaussians.means_mm)} Gaussians, {result.seconds['total']:.2f} s"
+    )
+    for view in result.quality.views:
+        coverage = "-" if view.coverage is None else f"{view.coverage:.0%}"
+        lines.append(f"view {view.view_id} ({view.name}): {coverage} of the vessels explained")
+    return lines

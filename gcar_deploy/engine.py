@@ -1,0 +1,238 @@
+"""Engine: a warm session for host programs; no prints, no global state, safe between threads."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import logging
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.scene import Scene, load_scene, match_picture, parse_scene
+from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.read import read_picture
+from gcar_deploy.output.result import Result
+from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.model_spec import read_model, shipped_model_path
+from gcar_deploy.reconstruct import reconstruct
+from gcar_deploy.stopwatch import OnProgress
+
+_log = logging.getLogger(__name__)
+
+#: a file, an array of counts, or a picture that already knows its C-arm
+Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
+#: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
+Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
+PREDICTORS = ("auto", "multi", "single", "none")
+_DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
+
+
+class Engine:
+    """Holds the model and the options; one instance may serve many threads.
+
+    Parameters
+    ----------
+    model : path of an ONNX file with its spec beside it; None for the shipped one
+    threads : int, threads within one inference; None for the number of cores, at most 4
+    options : RunOptions; ``options.predict.predictor`` says which predictor
+    session : an existing ``onnxruntime.InferenceSession`` of that model
+
+    Raises
+    ------
+    ModelError
+        The model is missing, altered or unfit.
+    """
+
+    def __init__(
+        self,
+        model: str | Path | None = None,
+        *,
+        threads: int | None = None,
+        options: RunOptions | None = None,
+        session: Any = None,
+    ) -> None:
+        self.options = options or RunOptions()
+        if threads is not None and threads < 1:
+            raise UsageError(f"threads = {threads} must be 1 or more")
+        self.threads = threads or min(os.cpu_count() or 1, 4)
+        self._predictor = _load(model, self.options.predict.predictor, self.threads, session)
+
+    @property
+    def model(self) -> Mapping[str, str] | None:
+        """Name and SHA-256 of the loaded model; None without one."""
+        if self._predictor is None:
+            return None
+        return {"name": self._predictor.model.name, "sha256": self._predictor.model.sha256}
+
+    def warmup(self) -> float:
+        """Run a small generated case once, so that the next call finds everything loaded.
+
+        Returns
+        -------
+        seconds that it took
+        """
+        from gcar_deploy.selftest import tiny_case
+
+        angiograms, grid, _ = tiny_case()
+        return float(self.reconstruct(angiograms, grid).seconds["total"])
+
+    def reconstruct(
+        self,
+        views: Sequence[Picture],
+        geometry: Geometry,
+        *,
+        on_progress: OnProgress | None = None,
+        deadline_s: float | None = None,
+        cancel: Callable[[], bool] | None = None,
+    ) -> Result:
+        """Reconstruct one tree.
+
+        Parameters
+        ----------
+        views : 2 or more pictures, in the order of the geometry's views
+        geometry : where they were taken from
+        on_progress : called with (stage, share of the work done) from the calling thread
+        deadline_s : seconds after which the refinement ends with what it has (``degraded``)
+        cancel : callable, for instance ``threading.Event().is_set``
+
+        Raises
+        ------
+        UsageError, ImageError, GeometryError, RefusedError, CancelledError, NumericalError
+        """
+        if deadline_s is not None and not deadline_s > 0:
+            raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
+        angiograms, grid, notes = prepare(views, geometry, self.options)
+        result = reconstruct(
+            angiograms,
+            grid,
+            self.options,
+            predictor=self._predictor,
+            on_progress=on_progress,
+            deadline_s=deadline_s,
+            cancel=cancel,
+        )
+        return dataclasses.replace(result, notes=(*notes, *result.notes))
+
+
+def prepare(
+    views: Sequence[Picture], geometry: Geometry, options: RunOptions
+) -> tuple[list[Angiogram], Grid, list[str]]:
+    """Pair pictures with their views.
+
+    Returns
+    -------
+    angiograms, grid asked for, sentences worth telling
+
+    Raises
+    ------
+    UsageError
+        Fewer than two pictures.
+    GeometryError
+        Not as many pictures as views, or sizes at odds.
+    ImageError
+        A picture cannot be read.
+    """
+    if len(views) < 2:
+        raise UsageError(f"{len(views)} picture given; two or more are needed")
+    given = [view for view in views if isinstance(view, Angiogram)]
+    if isinstance(geometry, Grid):
+        if len(given) != len(views):
+            raise UsageError("a Grid alone tells no geometry: give a scene, or Angiograms")
+        return given, geometry, []
+    scene = _scene(geometry)
+    if len(scene.views) != len(views):
+        raise GeometryError(
+            f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
+        )
+    notes = list(scene.warnings)
+    angiograms = []
+    for picture, view in zip(views, scene.views, strict=True):
+        if isinstance(picture, Angiogram):
+            angiograms.append(picture)
+            continue
+        if isinstance(picture, np.ndarray):
+            pixels, depth, sha256 = _from_array(view.id, picture, options.imaging.limits)
+        else:
+            pixels, depth, sha256 = read_picture(picture, options.imaging.limits)
+        try:
+            carm, note = match_picture(view.carm, *pixels.shape)
+        except GeometryError as error:
+            raise GeometryError(f"view {view.id}: {error}") from None
+        if note:
+            notes.append(f"view {view.id}: {note}")
+        angiograms.append(
+            Angiogram(
+                view_id=view.id,
+                carm=carm,
+                pixels=pixels,
+                bit_depth=depth,
+                intensity=view.intensity,
+                sha256=sha256,
+            )
+        )
+    return angiograms, scene.volume_grid(), notes
+
+
+def _from_array(
+    view_id: str, array: np.ndarray, limits: PictureLimits
+) -> tuple[np.ndarray, int, str]:
+    """Like ``read_picture`` for counts that are in memory already."""
+    depth = _DEPTHS.get(array.dtype.name)
+    if depth is None or array.ndim != 2:
+        raise ImageError(
+            f"view {view_id}: an array of {array.dtype} with {array.ndim} dimensions; give "
+            "(rows, columns) of uint8, uint16, float32 or float64"
+        )
+    if not limits.min_side <= min(array.shape) <= max(array.shape) <= limits.max_side:
+        raise ImageError(
+            f"view {view_id}: {array.shape[0]} x {array.shape[1]} pixels; each side must be "
+            f"{limits.min_side} .. {limits.max_side}"
+        )
+    if not (np.isfinite(array).all() and array.min() >= 0):
+        raise ImageError(f"view {view_id}: grey values must be finite and not negative")
+    sha256 = hashlib.sha256(f"{array.dtype.name}{array.shape}".encode())
+    sha256.update(np.ascontiguousarray(array).tobytes())
+    return array.astype(np.float32), depth, sha256.hexdigest()
+
+
+def _scene(geometry: Geometry) -> Scene:
+    if isinstance(geometry, Scene):
+        return geometry
+    if isinstance(geometry, Mapping):
+        import json
+
+        try:
+            return parse_scene(json.dumps(dict(geometry)), "geometry")
+        except (TypeError, ValueError) as error:
+            raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
+    if isinstance(geometry, (str, Path)):
+        return load_scene(geometry)
+    raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")
+
+
+def _load(
+    model: str | Path | None, wanted: str, threads: int, session: Any
+) -> CenterPredictor | None:
+    if wanted not in PREDICTORS:
+        raise UsageError(f"predictor = {wanted!r} is none of {', '.join(PREDICTORS)}")
+    if wanted == "none":
+        if model is not None:
+            raise UsageError("predictor none uses no model; leave the model away")
+        return None
+    if wanted == "single":
+        # The single-view predictor has other inputs and no shipped model yet.
+        raise ModelError("predictor single has no model in this version; use multi or none")
+    path = shipped_model_path() if model is None else Path(model)
+    if path is None:
+        if wanted == "multi":
+            raise ModelError("no model is installed with this version; give one, or use none")
+        _log.info("no model is installed: the visual hull is thinned instead")
+        return None
+    return CenterPredictor(read_model(path), threads=threads, session=session)

@@ -1,0 +1,125 @@
+"""What can be said of pictures and geometry before any reconstruction."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.engine import prepare
+from gcar_deploy.errors import GcarError
+from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.observability import silent_errors
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.quality import check_consistency, check_views
+from gcar_deploy.reconstruct import poses_between
+
+
+@dataclasses.dataclass(kw_only=True)
+class Inspection:
+    """Findings per view and per pair, warnings, and the error that ``gcar run`` would end with.
+
+    Attributes
+    ----------
+    views : one dict per view: id, name, magnification, pixel_at_isocenter_mm, coverage,
+        vessel_share (None before its vessels were found)
+    pairs : one dict per pair: first, second, separation_deg, disagreement, shift_mm, after_shift
+    warnings : sentences
+    silent : errors of the geometry that no picture can show, with their effect
+    error : what ``gcar run`` would raise, or None
+    """
+
+    views: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    pairs: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    silent: list[str] = dataclasses.field(default_factory=list)
+    error: GcarError | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-able dict."""
+        error = self.error
+        return {
+            "schema": "gcar-validation/1",
+            "would": "reconstruct" if error is None else "refuse",
+            "exit_code": 0 if error is None else error.exit_code,
+            "reason": None if error is None else str(error),
+            "views": self.views,
+            "pairs": self.pairs,
+            "warnings": self.warnings,
+            "silent_errors": self.silent,
+        }
+
+
+def inspect_files(
+    pictures: Sequence[str | Path], geom: str | Path, options: RunOptions | None = None
+) -> Inspection:
+    """Read and judge; errors end the inspection and stand in it, nothing is raised."""
+    options = options or RunOptions()
+    found = Inspection()
+    try:
+        angiograms, grid, warnings = prepare(pictures, geom, options)
+        found.warnings += warnings
+        carms = [a.carm for a in angiograms]
+        for a in angiograms:
+            found.views.append(
+                {
+                    "id": a.view_id,
+                    "name": a.carm.clinical_name(),
+                    "magnification": a.carm.magnification,
+                    "pixel_at_isocenter_mm": a.carm.pixel_at_isocenter_mm,
+                    "coverage": volume_coverage(a.carm, grid),
+                    "vessel_share": None,
+                }
+            )
+        for a, b in itertools.combinations(angiograms, 2):
+            found.pairs.append(
+                {
+                    "first": a.view_id,
+                    "second": b.view_id,
+                    "separation_deg": separation_deg(a.carm, b.carm),
+                    "disagreement": None,
+                    "shift_mm": None,
+                    "after_shift": None,
+                }
+            )
+        found.silent += silent_errors(carms)
+        found.warnings += check_views(angiograms, options.quality)
+        views = []
+        for entry, angiogram in zip(found.views, angiograms, strict=True):
+            view = extract_vessels(angiogram, options.imaging)
+            entry["vessel_share"] = float(view.mask.mean())
+            views.append(view)
+        found.warnings += _consistency(found, views, options)
+    except GcarError as error:
+        found.error = error
+    return found
+
+
+def volume_coverage(carm: CArm, grid: Grid) -> float:
+    """Share of the volume that a view sees, from a lattice of 16^3 points."""
+    axes = [(np.arange(16) + 0.5) / 16 * n - 0.5 for n in grid.shape]
+    index = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    pixels, depth = carm.project(grid.index2world(index))
+    inside = (pixels > -0.5).all(axis=1) & (pixels[:, 0] < carm.columns - 0.5)
+    return float((inside & (pixels[:, 1] < carm.rows - 0.5) & (depth > 0)).mean())
+
+
+def _consistency(found: Inspection, views: Sequence[VesselImage], options: RunOptions) -> list[str]:
+    for k in range(len(views) - 1):
+        first = views[k]
+        for view, pose in zip(views[k + 1 :], poses_between(views[k:], options)[1:], strict=True):
+            pair = next(
+                p for p in found.pairs if (p["first"], p["second"]) == (first.view_id, view.view_id)
+            )
+            pair["disagreement"] = pose.before
+            pair["shift_mm"] = float(np.linalg.norm(pose.offset_mm))
+            pair["after_shift"] = pose.after
+    after = [0.0] + [p["after_shift"] for p in found.pairs if p["first"] == views[0].view_id]
+    return check_consistency(views, after, options.quality)

@@ -1,0 +1,71 @@
+"""The result folder: every file rendered in memory, then written all or nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from gcar_deploy.output.folder import write_folder
+from gcar_deploy.output.overlay import overlay, png_bytes
+from gcar_deploy.output.report import report_html
+from gcar_deploy.output.result import Result
+from gcar_deploy.output.tables import (
+    centerline_csv,
+    centerline_vtp,
+    gaussians_npz,
+    gaussians_ply,
+)
+from gcar_deploy.output.volume import nifti_bytes
+from gcar_deploy.tree.surface import lumen_surface, stl_bytes
+
+RESULT_NAME = "result.json"
+#: lattice of the lumen surface: finer than a section every 0.8 mm, and still a few megabytes
+SURFACE_EDGE_MM = 0.4
+
+
+def render_files(result: Result) -> dict[str, bytes]:
+    """File name -> content of everything in the folder, ``result.json`` last.
+
+    ``result.json`` lists size and SHA-256 of every other file under ``files``.
+    """
+    makers: dict[str, Callable[[], bytes]] = {
+        "volume.nii.gz": lambda: nifti_bytes(result.volume, result.grid),
+        "gaussians.npz": lambda: gaussians_npz(result.gaussians),
+        "gaussians.ply": lambda: gaussians_ply(result.gaussians),
+        "centerline.vtp": lambda: centerline_vtp(result.tree),
+        "centerline.csv": lambda: centerline_csv(result.tree),
+        "surface.stl": lambda: stl_bytes(lumen_surface(result.tree, SURFACE_EDGE_MM)),
+    }
+    files = {name: make() for name, make in makers.items()}
+    overlays = [
+        overlay(angiogram.pixels, view, result.tree, judged, result.options.quality)
+        for angiogram, view, judged in zip(
+            result.angiograms, result.views, result.quality.views, strict=True
+        )
+    ]
+    for number, picture in enumerate(overlays, start=1):
+        files[f"overlay_view{number}.png"] = png_bytes(picture)
+    summary = result.summary()
+    files["report.html"] = report_html(result, summary, overlays).encode("utf-8")
+    summary["files"] = {
+        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in files.items()
+    }
+    files[RESULT_NAME] = (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode("utf-8")
+    return files
+
+
+def write_result(result: Result, out_dir: Path, *, force: bool = False) -> Path:
+    """Write the result folder.
+
+    Raises
+    ------
+    UsageError
+        The folder exists (without ``force``), is a link or a file, or cannot be made.
+    GcarError
+        The disk refused; nothing is left.
+    """
+    write_folder(out_dir, render_files(result), force=force)
+    return out_dir

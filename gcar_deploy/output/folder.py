@@ -1,0 +1,159 @@
+"""A folder that appears whole or not at all, also when the process is interrupted."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from gcar_deploy.errors import GcarError, UsageError
+
+_AT_FDCWD = -100
+_RENAME_NOREPLACE = 1
+_RENAME_EXCHANGE = 2
+
+
+def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -> None:
+    """Refuse a folder that must not be written, before any work is done.
+
+    Raises
+    ------
+    UsageError
+        ``out_dir`` is a link or a file, exists without ``force``, holds an input or the
+        working folder, or no folder can be made there.
+    """
+    if out_dir.is_symlink():
+        raise UsageError(f"{out_dir} is a symbolic link; name a folder of its own")
+    if out_dir.exists():
+        if not out_dir.is_dir():
+            raise UsageError(f"{out_dir} is a file; name a folder")
+        if not force:
+            raise UsageError(f"{out_dir} exists; choose another folder or add --force")
+        if out_dir.is_mount():
+            raise UsageError(f"{out_dir} is a mount point, which cannot be replaced")
+        whole = out_dir.resolve()
+        for precious in (Path.cwd(), Path.home(), *(path.resolve() for path in inputs)):
+            if precious == whole or whole in precious.parents:
+                raise UsageError(f"{out_dir} holds {precious}; --force would delete that")
+    ancestor = out_dir.absolute().parent
+    while not ancestor.exists() and not ancestor.is_symlink():
+        ancestor = ancestor.parent
+    if not ancestor.is_dir():
+        raise UsageError(f"{out_dir} cannot be made: {ancestor} is not a folder")
+    if not os.access(ancestor, os.W_OK | os.X_OK):
+        raise UsageError(f"{out_dir} cannot be made: {ancestor} is not writable")
+
+
+def write_folder(out_dir: Path, files: Mapping[str, bytes], *, force: bool = False) -> None:
+    """Write files into a new folder by way of a temporary one beside it and a rename.
+
+    The files are on the disk before the rename. An existing folder (with ``force``) is
+    exchanged in one step where the system can, and removed afterwards; whatever happens, one
+    of the two complete folders stands at ``out_dir``.
+
+    Raises
+    ------
+    UsageError
+        As ``check_target``.
+    GcarError
+        The disk refused.
+    """
+    check_target(out_dir, force=force)
+    try:
+        with _parents(out_dir), _scratch(out_dir) as scratch:
+            fresh = scratch / "new"
+            fresh.mkdir()
+            for name, data in files.items():
+                _write(fresh / name, data)
+            _sync_folder(fresh)
+            _put(fresh, out_dir, scratch / "old", force=force)
+            _sync_folder(out_dir.absolute().parent)
+    except OSError as error:
+        raise GcarError(f"{out_dir} cannot be written ({error.strerror or error})") from None
+
+
+@contextlib.contextmanager
+def _parents(out_dir: Path) -> Iterator[None]:
+    """Make missing parents; take those away again if the body fails."""
+    missing: list[Path] = []
+    parent = out_dir.absolute().parent
+    while not parent.exists():
+        missing.append(parent)
+        parent = parent.parent
+    try:
+        for folder in reversed(missing):
+            folder.mkdir(exist_ok=True)
+        yield
+    except BaseException:
+        # An interrupt as well must leave nothing; another process's files stay.
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def _scratch(out_dir: Path) -> Iterator[Path]:
+    """Temporary folder in the same file system; removed also on an interrupt."""
+    scratch = Path(tempfile.mkdtemp(prefix=".gcar-", dir=out_dir.absolute().parent))
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _write(path: Path, data: bytes) -> None:
+    with open(path, "xb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _sync_folder(path: Path) -> None:
+    if os.name != "posix":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _put(fresh: Path, out_dir: Path, old: Path, *, force: bool) -> None:
+    if not out_dir.exists():
+        if not _rename2(fresh, out_dir, _RENAME_NOREPLACE):
+            os.rename(fresh, out_dir)
+        return
+    if not force:
+        raise FileExistsError(errno.EEXIST, "it exists by now", str(out_dir))
+    if _rename2(fresh, out_dir, _RENAME_EXCHANGE):
+        return
+    os.rename(out_dir, old)
+    try:
+        os.rename(fresh, out_dir)
+    except BaseException:
+        os.rename(old, out_dir)
+        raise
+
+
+def _rename2(source: Path, target: Path, flag: int) -> bool:
+    """Linux renameat2; False where the system or file system has no such call."""
+    if not sys.platform.startswith("linux"):
+        return False
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    done = call(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag)
+    if done == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EPERM):
+        return False
+    raise OSError(code, os.strerror(code), str(target))

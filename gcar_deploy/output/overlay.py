@@ -1,0 +1,182 @@
+"""overlay_view*.png: each picture with the reprojected centreline, readable on its own."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import QualityOptions
+from gcar_deploy.errors import GcarError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.quality import ViewQuality, unexplained
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Array, Image, Mask, Pixels
+
+#: smaller pictures are enlarged by a whole number until labels are readable
+_MIN_WIDTH = 768
+#: but never beyond this: a long strip would become huge
+_MAX_SIDE = 4096
+#: pictures are dimmed, so that thin coloured lines stand out on bright vessels as well
+_DIM = 0.65
+_SHIFT = 4
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_BAR_MM = 20
+_WHITE, _BLACK, _RED = (255, 255, 255), (0, 0, 0), (60, 40, 255)
+_AROUND = tuple((dx, dy) for dx in (-2, -1, 0, 1, 2) for dy in (-2, -1, 0, 1, 2) if dx or dy)
+#: branches shorter than this on the screen get no number, numbers keep this distance, pixels
+_NUMBER_GAP = 30
+
+
+def branch_color(number: int) -> tuple[int, int, int]:
+    """Return the colour (blue, green, red) of a branch; the same in the report."""
+    # Golden-ratio steps keep neighbouring numbers far apart on the colour circle; red is left
+    # out, since it marks what the tree does not explain.
+    hue = 0.10 + 0.80 * ((0.45 + number * 0.618034) % 1.0)
+    red, green, blue = colorsys.hsv_to_rgb(hue, 0.65, 1.0)
+    return round(blue * 255), round(green * 255), round(red * 255)
+
+
+def grey8(pixels: Image) -> Array:
+    """(rows, cols) uint8 of a picture, stretched between its 0.5 and 99.8 percentiles."""
+    low, high = (float(x) for x in np.percentile(pixels, (0.5, 99.8)))
+    if high <= low:
+        low, high = float(pixels.min()), max(float(pixels.max()), float(pixels.min()) + 1.0)
+    stretched: Array = np.clip((pixels - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
+    return stretched
+
+
+def overlay(
+    pixels: Image, view: VesselImage, tree: Tree, judged: ViewQuality, options: QualityOptions
+) -> Array:
+    """Draw one view.
+
+    Parameters
+    ----------
+    pixels : (rows, cols) float32 picture as it was given
+    view : what was found in it, with the C-arm as it was used (pose applied)
+    tree : Tree
+    judged : ViewQuality, for the label
+    options : how near counts as explained
+
+    Returns
+    -------
+    (rows, cols, 3) uint8, blue green red, at least 768 wide
+    """
+    rows, columns = pixels.shape
+    zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
+    base = cv2.resize(grey8(pixels), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+    canvas = cv2.cvtColor((base * _DIM).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    missing = unexplained(tree, view, options)
+    _mark(canvas, missing, zoom)
+    lines = [_line(branch.points_mm, view.carm, zoom) for branch in tree.branches]
+    width = max(2, round(canvas.shape[1] / 500))
+    # A dark casing under each line keeps every colour readable on bright vessels.
+    for extra, cased in ((2, True), (0, False)):
+        for number, line in enumerate(lines):
+            if len(line) > 1:
+                points = np.rint(line * 2**_SHIFT).astype(np.int32)
+                color = _BLACK if cased else branch_color(number)
+                cv2.polylines(canvas, [points], False, color, width + extra, cv2.LINE_AA, _SHIFT)
+    _numbers(canvas, lines)
+    _labels(canvas, judged)
+    _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom)
+    return canvas
+
+
+def png_bytes(picture: Array) -> bytes:
+    """Encode a picture as PNG.
+
+    Raises
+    ------
+    GcarError
+        OpenCV could not.
+    """
+    ok, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    if not ok:
+        raise GcarError("a picture could not be encoded as PNG")
+    return bytes(data.tobytes())
+
+
+def _line(points_mm: Array, carm: CArm, zoom: int) -> Pixels:
+    """(n, 2) col, row of the enlarged picture; only what lies in front of the source."""
+    pixels, depth = carm.project(points_mm)
+    line: Pixels = np.clip((pixels[depth > 1.0] + 0.5) * zoom - 0.5, -16000, 16000)
+    return line
+
+
+def _mark(canvas: Array, missing: Mask, zoom: int) -> None:
+    """Paint skeleton pixels that no branch explains."""
+    size = (canvas.shape[1], canvas.shape[0])
+    big = cv2.resize(missing.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    if zoom < 4:
+        big = cv2.dilate(big, np.ones((3, 3), np.uint8))
+    canvas[big > 0] = _RED
+
+
+def _numbers(canvas: Array, lines: list[Pixels]) -> None:
+    """Write the number of each branch beside its middle, where there is room."""
+    scale = max(canvas.shape[1] / 1500, 0.5)
+    taken: list[Pixels] = []
+    for number, line in enumerate(lines):
+        if len(line) < 2 or np.ptp(line, axis=0).max() < _NUMBER_GAP:
+            continue
+        at = line[len(line) // 2]
+        if any(np.linalg.norm(at - other) < _NUMBER_GAP * 2 * scale for other in taken):
+            continue
+        taken.append(at)
+        place = (round(at[0]) + 8, round(at[1]) - 6)
+        _text(canvas, str(number + 1), place, scale, branch_color(number))
+
+
+def _labels(canvas: Array, judged: ViewQuality) -> None:
+    size = max(canvas.shape[1] / 1000, 0.6)
+    _text(canvas, f"View {judged.view_id}: {judged.name}", (14, round(34 * size)), size)
+    if judged.coverage is not None:
+        text = f"{judged.coverage:.0%} of the vessels explained"
+        _text(canvas, text, (14, round(62 * size)), 0.7 * size)
+
+
+def _legend(canvas: Array, pixel_mm: float) -> None:
+    """Scale bar at the bottom left, meaning of the colours at the bottom right."""
+    rows, columns = canvas.shape[:2]
+    size = max(columns / 1600, 0.5)
+    x, y, width = 14, rows - 16, max(2, round(_BAR_MM / pixel_mm))
+    cv2.line(canvas, (x, y), (x + width, y), _BLACK, 6, cv2.LINE_AA)
+    cv2.line(canvas, (x, y), (x + width, y), _WHITE, 2, cv2.LINE_AA)
+    _text(canvas, f"{_BAR_MM} mm at the isocentre", (x, y - round(20 * size)), size)
+    entries = (("centreline, a colour a branch", branch_color(0)), ("vessel not explained", _RED))
+    step = round(34 * size)
+    wide = max(_width(text, size) for text, _ in entries)
+    for k, (text, color) in enumerate(entries):
+        row = rows - 16 - step * (len(entries) - 1 - k)
+        left = columns - 14 - wide
+        middle = row - round(9 * size)
+        cv2.line(canvas, (left - 44, middle), (left - 12, middle), _BLACK, 6, cv2.LINE_AA)
+        cv2.line(canvas, (left - 44, middle), (left - 12, middle), color, 3, cv2.LINE_AA)
+        _text(canvas, text, (left, row), size)
+
+
+def _width(text: str, size: float) -> int:
+    return int(cv2.getTextSize(text, _FONT, size, 1)[0][0])
+
+
+def _text(
+    canvas: Array,
+    text: str,
+    at: tuple[int, int],
+    size: float,
+    color: tuple[int, int, int] = _WHITE,
+) -> None:
+    # Hershey fonts know ASCII only; what does not fit is cut rather than drawn outside.
+    shown = text.encode("ascii", "replace").decode("ascii")
+    room = canvas.shape[1] - at[0] - 8
+    while len(shown) > 1 and _width(shown, size) > room:
+        shown = shown[:-2] + "."
+    # The outline is the same text moved about: a thicker stroke would be wider letter by letter.
+    for dx, dy in _AROUND:
+        cv2.putText(canvas, shown, (at[0] + dx, at[1] + dy), _FONT, size, _BLACK, 1, cv2.LINE_AA)
+    cv2.putText(canvas, shown, at, _FONT, size, color, 1, cv2.LINE_AA)

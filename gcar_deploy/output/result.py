@@ -1,0 +1,189 @@
+"""Result: everything one reconstruction found, as arrays, as JSON, as a folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.quality import Quality
+from gcar_deploy.refine.pose import Pose
+from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.types import Volume
+
+SCHEMA = "gcar-result/1"
+RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or treatment."
+_PACKAGES = (
+    "gcar", "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "onnxruntime",
+    "nibabel",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """One reconstruction.
+
+    Attributes
+    ----------
+    quality : Quality
+    tree : Tree, mm LPS
+    gaussians : Gaussians
+    volume : (nx, ny, nz) float32 vessel occupancy 0 .. 1 on ``grid``
+    grid : Grid
+    angiograms : the pictures as they were given
+    views : what was found in them, with the geometry that was used (poses applied)
+    poses : correction of each view against the first
+    seconds : wall-clock seconds per stage, and ``total``
+    counts : whole numbers worth knowing (candidates, Gaussians, steps ...)
+    losses : objective after every accepted refinement step
+    predictor, refiner : what was used
+    model : name and SHA-256 of the model, None without one
+    notes : sentences for the user that do not lower the status
+    options : RunOptions
+    """
+
+    quality: Quality
+    tree: Tree
+    gaussians: Gaussians
+    volume: Volume
+    grid: Grid
+    angiograms: tuple[Angiogram, ...]
+    views: tuple[VesselImage, ...]
+    poses: tuple[Pose, ...]
+    seconds: Mapping[str, float]
+    counts: Mapping[str, int]
+    losses: tuple[float, ...]
+    predictor: str
+    refiner: str
+    model: Mapping[str, str] | None
+    notes: tuple[str, ...]
+    options: RunOptions
+
+    @property
+    def status(self) -> str:
+        """``ok`` or ``degraded``."""
+        return self.quality.status
+
+    def summary(self) -> dict[str, Any]:
+        """Content of ``result.json`` without the list of files; plain, finite values only."""
+        reasons: dict[str, str] = {}
+        body = {
+            "schema": SCHEMA,
+            "status": self.quality.status,
+            "sentence": self.quality.sentence,
+            "findings": list(self.quality.findings),
+            "notes": list(self.notes),
+            "separation_deg": self.quality.separation_deg,
+            "epipolar_disagreement": self.quality.disagreement,
+            "views": [self._view(k) for k in range(len(self.views))],
+            "tree": {
+                "length_mm": self.tree.length_mm,
+                "branches": [_branch(branch) for branch in self.tree.branches],
+            },
+            "volume": {
+                "center_mm": list(self.grid.center_mm),
+                "size_mm": list(self.grid.size_mm),
+                "shape": list(self.grid.shape),
+            },
+            "counts": dict(self.counts),
+            "losses": list(self.losses),
+            "seconds": dict(self.seconds),
+            "predictor": self.predictor,
+            "refiner": self.refiner,
+            "model": None if self.model is None else dict(self.model),
+            "options": dataclasses.asdict(self.options),
+            "versions": versions(),
+            "use": RESEARCH_USE,
+        }
+        out: dict[str, Any] = plain(body, "", reasons)
+        if self.model is None:
+            reasons["/model"] = "made without a model"
+        out["reasons"] = reasons
+        return out
+
+    def to_json(self) -> str:
+        """``summary`` as strict JSON text."""
+        return json.dumps(self.summary(), indent=1, allow_nan=False) + "\n"
+
+    def save(self, out_dir: str | Path, *, force: bool = False) -> Path:
+        """Write the result folder, all or nothing; see ``output.bundle``."""
+        from gcar_deploy.output.bundle import write_result
+
+        return write_result(self, Path(out_dir), force=force)
+
+    def _view(self, k: int) -> dict[str, Any]:
+        angiogram, judged, pose = self.angiograms[k], self.quality.views[k], self.poses[k]
+        return {
+            "id": angiogram.view_id,
+            "name": judged.name,
+            "picture": {
+                "sha256": angiogram.sha256,
+                "bit_depth": angiogram.bit_depth,
+                "rows": angiogram.carm.rows,
+                "columns": angiogram.carm.columns,
+            },
+            "kind": self.views[k].kind,
+            "calibrated": self.views[k].calibrated,
+            "coverage": judged.coverage,
+            "support": judged.support,
+            "distance_mm": judged.distance_mm,
+            "overlap": judged.overlap,
+            "estimated_offset_mm": list(pose.offset_mm),
+            "estimated_primary_deg": pose.primary_deg,
+            "estimated_secondary_deg": pose.secondary_deg,
+        }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of everything that computes; None for what is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def _branch(branch: Branch) -> dict[str, Any]:
+    known = branch.sigma_mm[np.isfinite(branch.sigma_mm)]
+    return {
+        "start": branch.start,
+        "end": branch.end,
+        "length_mm": branch.length_mm,
+        "mean_radius_mm": float(branch.radius_mm.mean()),
+        "min_radius_mm": float(branch.radius_mm.min()),
+        "mean_sigma_mm": float(known.mean()) if len(known) else None,
+        "confidence": float(branch.confidence.mean()),
+    }
+
+
+def plain(value: Any, path: str, reasons: dict[str, str]) -> Any:
+    """Turn numbers, arrays, tuples and mappings into strict JSON values.
+
+    What is undefined becomes null; ``reasons`` then says why under its JSON pointer.
+    """
+    if isinstance(value, Mapping):
+        return {str(k): plain(v, f"{path}/{k}", reasons) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v, f"{path}/{k}", reasons) for k, v in enumerate(value)]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist(), path, reasons)
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        reasons[path] = "not finite"
+        return None
+    if value is None and not path.startswith("/options"):
+        reasons.setdefault(path, "not determined")
+    return value

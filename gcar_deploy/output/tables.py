@@ -1,0 +1,160 @@
+"""Gaussians and centreline as files other programs read: npz, ply, vtp, csv."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import struct
+import zipfile
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Array
+
+#: zeroth spherical harmonic, of the 3DGS convention's colour f_dc
+_SH0 = 0.28209479177387814
+_RED = (0.86, 0.16, 0.16)
+#: a viewer's opacity is a share; outside these its logit is no use
+_OPACITY_RANGE = (0.01, 0.99)
+_VTK_TYPES = {"float64": "Float64", "float32": "Float32", "int64": "Int64", "int32": "Int32"}
+
+
+def npz_bytes(arrays: Mapping[str, Array | str | float]) -> bytes:
+    """Lossless arrays; texts (units, frame) as 0-d string arrays, no pickles."""
+    stream = io.BytesIO()
+    # Not numpy.savez: a fixed date in every entry makes equal results equal byte for byte.
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for name, value in arrays.items():
+            entry = io.BytesIO()
+            np.lib.format.write_array(entry, np.asarray(value), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), entry.getvalue())
+    return stream.getvalue()
+
+
+def gaussians_npz(gaussians: Gaussians) -> bytes:
+    """Write every array of the Gaussians with its units."""
+    arrays: dict[str, Array | str | float] = {
+        "means_mm": gaussians.means_mm,
+        "scales_mm": gaussians.scales_mm,
+        "quaternions_wxyz": gaussians.quaternions_wxyz,
+        "intensity": gaussians.intensity,
+    }
+    if gaussians.sigma_mm is not None:
+        arrays["sigma_mm"] = gaussians.sigma_mm
+    arrays["frame"] = "LPS, mm, origin at the isocentre"
+    arrays["density"] = "intensity * exp(-0.5 d^T C^-1 d), C = R diag(scales^2) R^T; 1 = vessel"
+    return npz_bytes(arrays)
+
+
+def gaussians_ply(gaussians: Gaussians) -> bytes:
+    """Binary PLY in the convention of 3D Gaussian splatting viewers.
+
+    Scales are logs of mm, quaternions wxyz, opacity is the logit of the intensity, colour the
+    zeroth harmonic of one red.
+    """
+    n = len(gaussians.means_mm)
+    share = np.clip(gaussians.intensity, *_OPACITY_RANGE)
+    columns = np.concatenate(
+        [
+            gaussians.means_mm,
+            np.zeros((n, 3)),
+            np.tile((np.array(_RED) - 0.5) / _SH0, (n, 1)),
+            np.log(share / (1 - share))[:, None],
+            np.log(np.maximum(gaussians.scales_mm, 1e-6)),
+            gaussians.quaternions_wxyz,
+        ],
+        axis=1,
+    )
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{k}" for k in range(3)), "opacity"]
+    names += [f"scale_{k}" for k in range(3)] + [f"rot_{k}" for k in range(4)]
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += ["comment gcar; mm, patient LPS; scale_ log mm; rot_ wxyz; opacity logit"]
+    header += [f"element vertex {n}", *(f"property float {name}" for name in names), "end_header"]
+    return ("\n".join(header) + "\n").encode("ascii") + columns.astype("<f4").tobytes()
+
+
+def centerline_vtp(tree: Tree) -> bytes:
+    """XML PolyData, one polyline per branch, mm LPS, for VMTK and 3D Slicer."""
+    sizes = [len(branch) for branch in tree.branches]
+    radius = tree.radii()
+    point_data = {
+        "MaximumInscribedSphereRadius": radius,
+        "Radius": radius,
+        "Sigma": _of_points(tree, "sigma_mm"),
+        "Confidence": _of_points(tree, "confidence"),
+    }
+    cell_data = {
+        "BranchId": np.arange(1, len(sizes) + 1, dtype=np.int64),
+        "StartNode": np.array([branch.start for branch in tree.branches], dtype=np.int64),
+        "EndNode": np.array([branch.end for branch in tree.branches], dtype=np.int64),
+        "Length": np.array([branch.length_mm for branch in tree.branches], dtype=np.float64),
+    }
+    count = int(sum(sizes))
+    out = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32">',
+        "<PolyData>",
+        f'<Piece NumberOfPoints="{count}" NumberOfVerts="0" NumberOfLines="{len(sizes)}" '
+        'NumberOfStrips="0" NumberOfPolys="0">',
+        '<PointData Scalars="MaximumInscribedSphereRadius">',
+        *(_data_array(name, values) for name, values in point_data.items()),
+        "</PointData>",
+        "<CellData>",
+        *(_data_array(name, values) for name, values in cell_data.items()),
+        "</CellData>",
+        "<Points>",
+        _data_array("Points", tree.points().reshape(-1, 3), components=3),
+        "</Points>",
+        "<Lines>",
+        _data_array("connectivity", np.arange(count, dtype=np.int64)),
+        _data_array("offsets", np.cumsum(np.asarray(sizes, dtype=np.int64))),
+        "</Lines>",
+        "</Piece>",
+        "</PolyData>",
+        "</VTKFile>",
+    ]
+    return ("\n".join(out) + "\n").encode("ascii")
+
+
+def centerline_csv(tree: Tree) -> bytes:
+    """One row per centreline point; an unknown sigma is an empty field.
+
+    Branches are numbered from 1, as in the pictures, the report and ``centerline.vtp``.
+    """
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(
+        ["branch", "point", "arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
+    )
+    for number, branch in enumerate(tree.branches, start=1):
+        columns = np.column_stack(
+            [branch.arc_mm, branch.points_mm, branch.radius_mm, branch.sigma_mm, branch.confidence]
+        )
+        for point, row in enumerate(columns):
+            writer.writerow([number, point, *(_field(value) for value in row)])
+    return stream.getvalue().encode("ascii")
+
+
+def _of_points(tree: Tree, name: str) -> Array:
+    parts: Sequence[Array] = [getattr(branch, name) for branch in tree.branches]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _field(value: float) -> str:
+    return f"{value:.5f}" if np.isfinite(value) else ""
+
+
+def _data_array(name: str, values: Array, components: int = 1) -> str:
+    """Inline base64 block: its size in bytes as uint32, then the values."""
+    # Binary because VTK's text reader stops at "nan", the value of an unknown sigma.
+    raw = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<")).tobytes()
+    text = base64.b64encode(struct.pack("<I", len(raw)) + raw).decode("ascii")
+    kind = _VTK_TYPES[values.dtype.newbyteorder("=").name]
+    return (
+        f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" '
+        f'format="binary">{text}</DataArray>'
+    )

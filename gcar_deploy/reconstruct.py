@@ -1,0 +1,175 @@
+"""The composition: from pictures that know their C-arm to a tree with its uncertainty.
+
+vessels of every view -> pose between the views -> points that all views see as vessel
+-> which of them are vessel (learned, or by thinning) -> Gaussians and tubes refined against
+the pictures -> tree, volume -> quality
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gcar_deploy import quality
+from gcar_deploy.config import RunOptions
+from gcar_deploy.errors import NumericalError, UsageError
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.resample import sampled
+from gcar_deploy.output.result import Result
+from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
+from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.decide import decide
+from gcar_deploy.predict.encoding import encode
+from gcar_deploy.predict.thinning import thin_hull
+from gcar_deploy.refine.pose import Pose, estimate_poses
+from gcar_deploy.refine.refine import Refined, refine, refined_volume
+from gcar_deploy.refine.tube_model import footprint, tubes_of
+from gcar_deploy.stopwatch import OnProgress, Stopwatch
+from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Mask
+
+#: stages with their usual share of the time
+STAGES = (
+    ("vessels", 3.0), ("pose", 2.0), ("candidates", 1.0), ("centers", 2.0), ("refine", 6.0),
+    ("tree", 1.0), ("quality", 0.5),
+)  # fmt: skip
+_FALLBACK = "no model was used: depth was decided by thinning the visual hull"
+
+
+def reconstruct(
+    angiograms: Sequence[Angiogram],
+    grid: Grid,
+    options: RunOptions,
+    *,
+    predictor: CenterPredictor | None = None,
+    on_progress: OnProgress | None = None,
+    deadline_s: float | None = None,
+    cancel: Callable[[], bool] | None = None,
+) -> Result:
+    """Reconstruct the coronary tree that all views show.
+
+    Parameters
+    ----------
+    angiograms : 2 or more pictures with their C-arms
+    grid : Grid of the volume that is asked for
+    options : RunOptions
+    predictor : CenterPredictor, or None to thin the visual hull instead
+    on_progress : called with (stage, share of the work done)
+    deadline_s : seconds after which the refinement ends with what it has
+    cancel : called often; True ends the work with CancelledError
+
+    Raises
+    ------
+    RefusedError
+        No tree can honestly be made of these views.
+    CancelledError
+        Cancelled, or late before there was a result.
+    """
+    if len(angiograms) < 2:
+        raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
+    watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel)
+    findings = quality.check_views(angiograms, options.quality)
+    with watch.stage("vessels") as report:
+        views = _vessels(angiograms, options, report)
+    with watch.stage("pose"):
+        poses = poses_between(views, options)
+        findings += quality.check_consistency(views, [p.after for p in poses], options.quality)
+        views = [_posed(view, pose) for view, pose in zip(views, poses, strict=True)]
+    with watch.stage("candidates"):
+        lattice = cubic_lattice(grid, cell_mm(grid, options))
+        seen = [sampled(view, float(lattice.spacing_mm[0])) for view in views]
+        hull = visual_hull([(v.carm, v.path_mm) for v in seen], lattice, options.candidates)
+        quality.check_candidates(len(hull), lattice, options.quality)
+        encoded = encode(hull, [(v.carm, v.path_mm, v.calibrated) for v in seen])
+    with watch.stage("centers"):
+        if predictor is None:
+            centers = thin_hull(hull, encoded, options.candidates)
+            findings.append(_FALLBACK)
+        else:
+            calibrated = all(view.calibrated for view in views)
+            centers = predictor.predict(hull, encoded)
+            centers = decide(centers, encoded, calibrated, options.decide)
+    with watch.stage("refine") as report:
+        refined = refine(
+            centers, views, options.refine, on_progress=report, should_stop=watch.should_stop,
+            tree_options=options.tree,
+        )  # fmt: skip
+        if watch.cancelled:
+            watch.check()
+        if refined.status == "failed":
+            raise NumericalError("the refinement left the finite numbers")
+        if refined.status == "stopped":
+            findings.append("the deadline ended the refinement early")
+    with watch.stage("tree", keep_if_late=True):
+        tree = _tree(refined, centers, options)
+        quality.check_tree(tree, options.quality)
+        volume = refined_volume(refined, views, grid, options.refine)
+    with watch.stage("quality", keep_if_late=True):
+        lumen = [_lumen(tree, view, options) for view in views]
+        worst = max(p.after for p in poses)
+        judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
+    return Result(
+        quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
+        angiograms=tuple(angiograms), views=tuple(views), poses=poses,
+        seconds={**watch.seconds, "total": watch.elapsed_s},
+        counts={
+            "candidates": len(hull), "gaussians": len(refined.gaussians.means_mm),
+            "branches": len(tree.branches), "steps": refined.steps,
+            "rejected_steps": refined.rejected_steps,
+        },
+        losses=tuple(refined.losses), predictor=centers.source, refiner=options.refine.refiner,
+        model=None if predictor is None
+        else {"name": predictor.model.name, "sha256": predictor.model.sha256},
+        notes=(), options=options,
+    )  # fmt: skip
+
+
+def cell_mm(grid: Grid, options: RunOptions) -> float:
+    """Return the edge of the lattice: the grid's own where the predictor knows such cells."""
+    own = float(np.mean(grid.spacing_mm))
+    return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
+
+
+def _vessels(
+    angiograms: Sequence[Angiogram], options: RunOptions, report: Callable[[float], None]
+) -> list[VesselImage]:
+    views = []
+    for angiogram in angiograms:
+        views.append(extract_vessels(angiogram, options.imaging))
+        report(len(views) / len(angiograms))
+    return views
+
+
+def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Pose, ...]:
+    """Estimate the correction of every view against the first from their vessel profiles."""
+    # Profiles finer than a pixel are sampling noise.
+    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    pose = dataclasses.replace(
+        options.pose,
+        fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
+        coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
+    )
+    small = [sampled(view, options.predict.min_cell_mm) for view in views]
+    return estimate_poses([(view.carm, view.path_mm) for view in small], pose)
+
+
+def _posed(view: VesselImage, pose: Pose) -> VesselImage:
+    carm = pose.applied(view.carm)
+    return view if carm is view.carm else dataclasses.replace(view, carm=carm)
+
+
+def _tree(refined: Refined, centers: CenterPoints, options: RunOptions) -> Tree:
+    return refined.tree if refined.tree is not None else build_tree(centers, options.tree)
+
+
+def _lumen(tree: Tree, view: VesselImage, options: RunOptions) -> Mask:
+    smallest = options.imaging.path_threshold_pixels * view.carm.pixel_at_isocenter_mm
+    path = footprint(tubes_of(tree), view.carm, 1.0).image((view.carm.rows, view.carm.columns))
+    inside: Mask = path > smallest
+    return inside

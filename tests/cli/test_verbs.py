@@ -1,0 +1,165 @@
+"""What each verb prints and where; help, streams, exit codes of good calls."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from importlib import resources
+
+import pytest
+
+from gcar_deploy.cli.main import VERBS
+from tests.cli.conftest import gcar
+
+
+def run_arguments(case, out, *extra):
+    return (
+        "run", case / "view1.png", case / "view2.png", "--geom", case / "geom.json",
+        "--out", out, "--predictor", "none", *extra,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_shows_an_example(verb):
+    done = gcar(verb, "--help")
+    assert done.code == 0 and done.err == ""
+    assert "Example" in done.out and f"gcar {verb}" in done.out
+
+
+def test_group_help_names_every_verb_and_version_prints():
+    done = gcar("--help")
+    assert done.code == 0
+    for verb in VERBS:
+        assert f"  {verb} " in done.out
+    assert "gcar run view1.png view2.png --geom geom.json --out result" in done.out
+    assert gcar("--version").out.startswith("gcar")
+
+
+@pytest.mark.benchmark
+def test_help_is_quick():
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "gcar_deploy.cli.main", "--help"],
+            check=True,
+            capture_output=True,
+        )
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.15
+
+
+def test_run_prints_the_folder_first_and_nothing_on_stderr(good_case, tmp_path):
+    done = gcar(*run_arguments(good_case, tmp_path / "out", "--quiet"))
+    assert done.code == 0, done.err
+    lines = done.out.splitlines()
+    assert lines[0] == str(tmp_path / "out") and lines[1].startswith(("ok:", "degraded:"))
+    assert done.err == ""
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_json_is_one_object_that_is_the_result(good_case, tmp_path):
+    done = gcar(*run_arguments(good_case, tmp_path / "out", "--json"))
+    assert done.code == 0, done.err
+    printed = json.loads(done.out)
+    stored = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert printed.pop("out") == str(tmp_path / "out")
+    stored.pop("files")
+    assert printed == stored
+
+
+def test_json_of_a_refusal_is_one_object_too(good_case, tmp_path):
+    jsonschema = pytest.importorskip("jsonschema")
+    case = tmp_path / "case"
+    shutil.copytree(good_case, case)
+    shutil.copy(case / "view1.png", case / "view2.png")
+    done = gcar(*run_arguments(case, tmp_path / "out", "--json"))
+    assert done.code == 6
+    found = json.loads(done.out)
+    assert found["status"] == "refused" and found["sentence"] in done.err
+    schema = resources.files("gcar_deploy.output").joinpath("result.schema.json").read_text()
+    jsonschema.validate(found, json.loads(schema))
+
+
+def test_force_replaces_and_info_reads(good_case, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "old").write_text("1")
+    assert gcar(*run_arguments(good_case, out, "--force")).code == 0
+    assert not (out / "old").exists()
+    done = gcar("info", out)
+    assert done.code == 0 and "branches" in done.out and "Research use only" in done.out
+    assert json.loads(gcar("info", out, "--json").out)["altered"] == []
+    with open(out / "centerline.csv", "a") as stream:
+        stream.write("x")
+    done = gcar("info", out)
+    assert done.code == 2 and "centerline.csv" in done.err
+
+
+@pytest.mark.parametrize("content", [None, "{", "[]", '{"schema": "other"}'])
+def test_info_of_something_else(content, tmp_path):
+    if content is not None:
+        (tmp_path / "result.json").write_text(content)
+    done = gcar("info", tmp_path)
+    assert done.code == 2 and done.out == "" and len(done.err.splitlines()) == 1
+
+
+def test_rescaled_pictures_are_taken_and_that_is_said(good_case, tmp_path):
+    case = tmp_path / "case"
+    shutil.copytree(good_case, case)
+    data = json.loads((case / "geom.json").read_text())
+    for view in data["views"]:
+        view["rows"] = view["columns"] = 192
+        view["pixel_spacing_mm"] = [0.8, 0.8]
+    (case / "geom.json").write_text(json.dumps(data))
+    done = gcar(*run_arguments(case, tmp_path / "out"))
+    assert done.code == 0 and "0.5 times" in done.err
+
+
+def test_doctor_passes_its_self_test():
+    done = gcar("doctor", "--json")
+    assert done.code == 0, done.err
+    report = json.loads(done.out)
+    assert report["self_test"]["passed"] and not report["torch_imported"]
+    assert report["versions"]["numpy"]
+
+
+def test_demo_ends_with_a_picture_and_the_time(tmp_path):
+    done = gcar("demo", "--out", tmp_path / "demo")
+    assert done.code == 0, done.err
+    for words in ("DSC", "Ot(1 mm)", "Chamfer", "time:", "overlay_view1.png", "report.html"):
+        assert words in done.out
+    assert (tmp_path / "demo" / "overlay_view1.png").is_file()
+
+
+def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monkeypatch):
+    from gcar_deploy import engine
+
+    def broken(*_, **__):
+        raise ZeroDivisionError("division\nby zero")
+
+    monkeypatch.setattr(engine, "reconstruct", broken)
+    done = gcar(*run_arguments(good_case, tmp_path / "out"))
+    assert done.code == 1 and len(done.err.splitlines()) == 1 and "Traceback" not in done.err
+    assert done.err.startswith("gcar: error: internal error: ZeroDivisionError")
+    assert "Traceback" in gcar(*run_arguments(good_case, tmp_path / "out", "-v")).err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_progress_bar_is_for_terminals_only(monkeypatch, capsys):
+    from gcar_deploy.cli import common
+
+    monkeypatch.setattr(common, "_PATIENCE_S", -1.0)
+    bar = common.ProgressBar(quiet=False)
+    bar("refine", 0.5)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(common.sys.stderr, "isatty", lambda: True, raising=False)
+    with common.ProgressBar(quiet=False) as bar:
+        bar("refine", 0.5)
+        assert " 50% refine" in capsys.readouterr().err
+    with common.ProgressBar(quiet=True) as bar:
+        bar("refine", 0.5)
+    assert "refine" not in capsys.readouterr().err

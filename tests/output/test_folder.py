@@ -1,0 +1,171 @@
+"""A result folder appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.output import folder
+from gcar_deploy.output.folder import check_target, write_folder
+
+FILES = {"a.txt": b"alpha", "b.bin": bytes(range(256))}
+
+
+def listing(path: Path) -> dict[str, bytes]:
+    return {p.relative_to(path).as_posix(): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+
+
+def test_writes_exactly_the_files_and_nothing_beside(tmp_path):
+    write_folder(tmp_path / "out", FILES)
+    assert listing(tmp_path) == {f"out/{name}": data for name, data in FILES.items()}
+
+
+def test_makes_missing_parents(tmp_path):
+    write_folder(tmp_path / "x" / "y" / "out", FILES)
+    assert listing(tmp_path / "x" / "y" / "out") == FILES
+
+
+def test_an_existing_folder_is_refused_and_untouched(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine").write_bytes(b"1")
+    with pytest.raises(UsageError, match="--force"):
+        write_folder(out, FILES)
+    assert listing(out) == {"mine": b"1"}
+
+
+@pytest.mark.parametrize("exchange", [True, False], ids=["one step", "two renames"])
+def test_force_replaces_the_folder_whole(tmp_path, monkeypatch, exchange):
+    if not exchange:
+        monkeypatch.setattr(folder, "_rename2", lambda *_: False)
+    out = tmp_path / "out"
+    write_folder(out, {"old": b"1"})
+    write_folder(out, FILES, force=True)
+    assert listing(tmp_path) == {f"out/{name}": data for name, data in FILES.items()}
+
+
+@pytest.mark.parametrize("kind", ["link to folder", "dangling link", "file"])
+def test_links_and_files_are_refused(tmp_path, kind):
+    out = tmp_path / "out"
+    if kind == "file":
+        out.write_bytes(b"1")
+    else:
+        target = tmp_path / "target"
+        if kind == "link to folder":
+            target.mkdir()
+        out.symlink_to(target)
+    for force in (False, True):
+        with pytest.raises(UsageError):
+            write_folder(out, FILES, force=force)
+    assert out.is_symlink() or out.read_bytes() == b"1"
+
+
+def test_force_never_takes_inputs_or_the_working_folder_along(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    picture = out / "view1.png"
+    picture.write_bytes(b"1")
+    with pytest.raises(UsageError, match="delete"):
+        check_target(out, force=True, inputs=(picture,))
+    monkeypatch.chdir(out)
+    with pytest.raises(UsageError, match="delete"):
+        check_target(out, force=True)
+    with pytest.raises(UsageError):
+        check_target(Path("."), force=True)
+
+
+def test_a_file_in_the_way_of_the_parents(tmp_path):
+    (tmp_path / "x").write_bytes(b"1")
+    with pytest.raises(UsageError, match="not a folder"):
+        write_folder(tmp_path / "x" / "out", FILES)
+
+
+@pytest.mark.parametrize("step", ["_write", "_sync_folder", "_put"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left"), KeyboardInterrupt()])
+@pytest.mark.parametrize("existing", [False, True])
+def test_any_fault_leaves_what_was_there(tmp_path, monkeypatch, step, error, existing):
+    parent = tmp_path / "new"
+    if existing:
+        write_folder(parent / "out", {"old": b"1"})
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(folder, step, fail)
+    with pytest.raises(GcarError if isinstance(error, OSError) else KeyboardInterrupt):
+        write_folder(parent / "out", FILES, force=existing)
+    monkeypatch.undo()
+    assert listing(tmp_path) == ({"new/out/old": b"1"} if existing else {})
+    assert existing or not parent.exists()
+
+
+def test_a_failed_second_rename_puts_the_old_folder_back(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write_folder(out, {"old": b"1"})
+    monkeypatch.setattr(folder, "_rename2", lambda *_: False)
+    rename = os.rename
+
+    def refuse(source, target):
+        if Path(source).name == "new":
+            raise OSError(5, "Input/output error")
+        rename(source, target)
+
+    monkeypatch.setattr(folder.os, "rename", refuse)
+    with pytest.raises(GcarError):
+        write_folder(out, FILES, force=True)
+    monkeypatch.undo()
+    assert listing(tmp_path) == {"out/old": b"1"}
+
+
+def test_a_folder_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write = folder._write
+
+    def meanwhile(path, data):
+        write(path, data)
+        out.mkdir(exist_ok=True)
+        (out / "theirs").write_bytes(b"1")
+
+    monkeypatch.setattr(folder, "_write", meanwhile)
+    with pytest.raises(GcarError):
+        write_folder(out, FILES)
+    monkeypatch.undo()
+    assert listing(tmp_path) == {"out/theirs": b"1"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
+    out = tmp_path / "out"
+    script = (
+        "import sys, time\n"
+        "from gcar_deploy.cli import main as cli\n"
+        "from gcar_deploy.output import folder\n"
+        "from gcar_deploy.cli.main import main\n"
+        "write = folder._write\n"
+        "def slow(path, data):\n"
+        "    write(path, data)\n"
+        "    print('writing', flush=True)\n"
+        "    time.sleep(60)\n"
+        "folder._write = slow\n"
+        f"main(['demo', '--predictor', 'none', '--refiner', 'none', '--out', {str(out)!r}])\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "writing"
+        time.sleep(0.1)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert errors.strip().splitlines()[-1].startswith("gcar: error:")
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []

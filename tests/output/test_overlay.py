@@ -1,0 +1,112 @@
+"""Overlays: lines where the geometry puts them, and what is missing in red."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gcar_deploy.config import QualityOptions
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.output.overlay import branch_color, grey8, overlay, png_bytes
+from gcar_deploy.quality import ViewQuality, unexplained, view_quality
+from gcar_deploy.tree.tree import Branch, Tree, empty_tree
+
+RED = (60, 40, 255)
+OPTIONS = QualityOptions()
+JUDGED = ViewQuality(
+    view_id="1", name="RAO 30 CAU 20", coverage=0.5, support=None, distance_mm=None, overlap=None
+)
+
+
+def blank_view(rows=128, columns=96):
+    carm = CArm(
+        primary_angle_deg=-30.0, secondary_angle_deg=-20.0, sod_mm=750.0, sdd_mm=1050.0, rows=rows,
+        columns=columns, pixel_spacing_mm=(1.0, 1.0),
+    )  # fmt: skip
+    nothing = np.zeros((rows, columns), bool)
+    return VesselImage(
+        view_id="1", carm=carm, path_mm=np.zeros((rows, columns), np.float32), calibrated=True,
+        mask=nothing, skeleton=nothing, valid=~nothing, kind="path_length",
+    )  # fmt: skip
+
+
+def line_tree(carm):
+    """One straight branch seen from pixel (20, 60) to (70, 60), at the isocentre's depth."""
+    ends = carm.backproject(np.array([[20.0, 60.0], [70.0, 60.0]]), np.full(2, carm.sod_mm))
+    points = ends[0] + np.linspace(0, 1, 60)[:, None] * (ends[1] - ends[0])
+    branch = Branch(
+        points_mm=points, radius_mm=np.full(60, 1.5), sigma_mm=np.full(60, np.nan),
+        confidence=np.ones(60), start=0, end=1,
+    )  # fmt: skip
+    return Tree(nodes_mm=ends, branches=(branch,))
+
+
+def picture_of(view, tree):
+    pixels = np.zeros((view.carm.rows, view.carm.columns), np.float32)
+    return overlay(pixels, view, tree, JUDGED, OPTIONS)
+
+
+def test_line_lies_where_the_c_arm_projects_it():
+    view = blank_view()
+    picture = picture_of(view, line_tree(view.carm))
+    zoom = picture.shape[1] // view.carm.columns
+    rows, columns = np.nonzero((picture == branch_color(0)).all(axis=2))
+    middle = (np.abs(rows / zoom - 60.5) < 1.0) & (columns < 75 * zoom)
+    assert columns[middle].min() / zoom == pytest.approx(20.5, abs=0.7)
+    assert columns[middle].max() / zoom == pytest.approx(70.5, abs=0.7)
+
+
+def test_vessel_that_no_branch_explains_is_red():
+    view = blank_view()
+    skeleton = np.zeros_like(view.mask)
+    skeleton[60, 20:71] = True
+    skeleton[90, 20:61] = True
+    view = dataclasses.replace(view, skeleton=skeleton)
+    tree = line_tree(view.carm)
+    missing = unexplained(tree, view, OPTIONS)
+    assert missing[90, 20:61].all() and not missing[60].any()
+    judged = view_quality(tree, view, view.mask, OPTIONS)
+    assert judged.coverage == pytest.approx(1 - missing.sum() / skeleton.sum())
+    picture = picture_of(view, tree)
+    zoom = picture.shape[1] // view.carm.columns
+    assert tuple(picture[90 * zoom + zoom // 2, 40 * zoom + zoom // 2]) == RED
+    assert unexplained(empty_tree(), view, OPTIONS).sum() == skeleton.sum()
+
+
+@pytest.mark.parametrize(
+    "shape", [(16, 16), (96, 96), (128, 96), (512, 512), (40, 1200), (1200, 40)]
+)
+def test_wide_enough_to_read_and_never_huge(shape):
+    view = blank_view(*shape)
+    picture = picture_of(view, empty_tree())
+    assert picture.dtype == np.uint8 and picture.shape[2] == 3
+    assert picture.shape[0] % shape[0] == 0 and max(picture.shape) <= 4096
+    if max(shape) / min(shape) < 5:
+        assert picture.shape[1] >= 768
+    assert png_bytes(picture).startswith(b"\x89PNG")
+
+
+def test_names_that_the_font_lacks_or_that_are_too_long():
+    view = blank_view()
+    judged = dataclasses.replace(JUDGED, view_id="ü" * 300)
+    picture = overlay(np.zeros((128, 96), np.float32), view, empty_tree(), judged, OPTIONS)
+    assert picture.shape[1] >= 768
+
+
+def test_grey_stretch():
+    ramp = np.linspace(100, 4000, 10_000, dtype=np.float32).reshape(100, 100)
+    assert grey8(ramp).min() == 0 and grey8(ramp).max() == 255
+    assert (grey8(np.full((20, 20), 7, np.float32)) == 0).all()
+    lone = np.zeros((64, 64), np.float32)
+    lone[3, 3] = 9
+    assert grey8(lone)[3, 3] == 255
+
+
+def test_colours_differ_and_leave_red_alone():
+    colors = np.array([branch_color(k) for k in range(12)], float)
+    gap = np.abs(colors[:, None] - colors[None]).max(axis=2)[~np.eye(12, dtype=bool)]
+    assert gap.min() > 15
+    assert np.linalg.norm(colors - RED, axis=1).min() > 90

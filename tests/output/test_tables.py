@@ -1,0 +1,106 @@
+"""Details of the tables beyond what ``test_files`` reads back."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import zipfile
+
+import numpy as np
+import pytest
+
+from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.output.report import _jpeg, _scene, report_html
+from gcar_deploy.output.tables import centerline_csv, centerline_vtp, gaussians_npz, gaussians_ply
+from gcar_deploy.tree.tree import Branch, Tree
+
+
+def some_gaussians(n, sigma=None):
+    rng = np.random.default_rng(0)
+    return Gaussians(
+        means_mm=rng.normal(size=(n, 3)), scales_mm=rng.uniform(0.2, 2, (n, 3)),
+        quaternions_wxyz=rng.normal(size=(n, 4)), intensity=rng.uniform(0, 2, n), sigma_mm=sigma,
+    )  # fmt: skip
+
+
+def test_npz_is_lossless_and_holds_no_clock():
+    g = some_gaussians(5, sigma=np.full((5, 3), np.nan))
+    data = gaussians_npz(g)
+    assert data == gaussians_npz(g)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        for name in ("means_mm", "scales_mm", "quaternions_wxyz", "intensity", "sigma_mm"):
+            np.testing.assert_array_equal(stored[name], getattr(g, name))
+    with np.load(io.BytesIO(gaussians_npz(some_gaussians(2)))) as stored:
+        assert "sigma_mm" not in stored.files
+
+
+def test_ply_without_a_gaussian_is_valid():
+    plyfile = pytest.importorskip("plyfile")
+    data = plyfile.PlyData.read(io.BytesIO(gaussians_ply(some_gaussians(0))))
+    assert data["vertex"].count == 0 and not data.text
+
+
+def test_vtp_cells(result, tmp_path):
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    file = tmp_path / "line.vtp"
+    file.write_bytes(centerline_vtp(result.tree))
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(file))
+    reader.Update()
+    cells = reader.GetOutput().GetCellData()
+    branches = result.tree.branches
+    expected = {
+        "BranchId": np.arange(1, len(branches) + 1),
+        "Length": [branch.length_mm for branch in branches],
+        "StartNode": [branch.start for branch in branches],
+        "EndNode": [branch.end for branch in branches],
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(vtk_to_numpy(cells.GetArray(name)), values)
+
+
+def test_csv_numbers_arcs_and_unknown_sigma(result):
+    tree = result.tree
+    hidden = dataclasses.replace(tree.branches[0], sigma_mm=np.full(len(tree.branches[0]), np.nan))
+    tree = dataclasses.replace(tree, branches=(hidden, *tree.branches[1:]))
+    rows = list(csv.DictReader(io.StringIO(centerline_csv(tree).decode("ascii"))))
+    assert [int(row["branch"]) for row in rows] == list(tree.branch_index() + 1)
+    assert {row["sigma_mm"] for row in rows if row["branch"] == "1"} == {""}
+    last = [row for row in rows if row["branch"] == "1"][-1]
+    assert float(last["arc_mm"]) == pytest.approx(hidden.length_mm, abs=1e-4)
+
+
+def long_tree(branches=40, points=400):
+    t = np.linspace(0, 100, points)
+    line = np.stack([t, np.sin(t / 9), t * 0], axis=1)
+    made = tuple(
+        Branch(
+            points_mm=line + k, radius_mm=np.full(points, 1.234567),
+            sigma_mm=np.full(points, 0.123456), confidence=np.ones(points), start=0, end=1,
+        )
+        for k in range(branches)
+    )  # fmt: skip
+    return Tree(nodes_mm=np.stack([line[0], line[-1]]), branches=made)
+
+
+def test_report_stays_small_for_noisy_pictures_and_long_trees(result):
+    tree = long_tree()
+    long = dataclasses.replace(result, tree=tree)
+    noise = np.random.default_rng(0).integers(0, 255, (1024, 1024, 3), dtype=np.uint8)
+    assert len(report_html(long, long.summary(), [noise, noise])) < 1_500_000
+    drawn = _scene(long)["branches"]
+    assert sum(len(branch["points"]) for branch in drawn) < 3500
+    assert all(branch["arc"][-1] == pytest.approx(tree.branches[0].length_mm, abs=0.01)
+               for branch in drawn)  # fmt: skip
+
+
+def test_report_pictures_fit_their_budget():
+    rng = np.random.default_rng(0)
+    grey = np.repeat(np.repeat(rng.normal(120, 12, (512, 512)), 2, 0), 2, 1)
+    picture = np.repeat(grey.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    assert len(_jpeg(picture, 120_000)) <= 120_000
