@@ -1,0 +1,165 @@
+"""``gcar-export``: the workshop's command line. Thin: parse, call one function, print."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+
+import click
+
+from gcar_deploy.errors import GcarError, UsageError
+
+_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+class _Group(click.Group):
+    """Turn the project's errors into one line on stderr and their exit code."""
+
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except GcarError as error:
+            click.echo(f"error: {error}", err=True)
+            sys.exit(error.exit_code)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+def main(verbose: bool) -> None:
+    """Simulate, evaluate and score coronary reconstructions."""
+    level = logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
+
+
+@main.command()
+@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option(
+    "--protocol",
+    type=click.Choice(["paper", "clinical", "moved", "raw"]),
+    default="paper",
+    show_default=True,
+)
+@click.option(
+    "--methods",
+    default="ours,hull,hull+paper,visual_hull",
+    show_default=True,
+    help="Comma-separated; the first is the one the others are tested against.",
+)
+@click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows and tables.")
+@click.option("--jobs", default=1, show_default=True, help="Processes.")
+@click.option("--cases", default="", help="Only these cases, comma-separated.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def evaluate(
+    data: Path,
+    protocol: str,
+    methods: str,
+    views: str,
+    out: Path,
+    jobs: int,
+    cases: str,
+    quiet: bool,
+) -> None:
+    """Run methods over label volumes and print the table.
+
+    Goes on where an earlier run with the same --out stopped.
+
+    Example: gcar-export evaluate --data data --protocol clinical --methods ours,hull
+    --views 2,4 --out results
+    """
+    from gcar_export import evaluate as evaluation
+    from gcar_export import evaluation_tables
+
+    options = evaluation.EvaluateOptions(
+        data=data,
+        out=out,
+        protocol=protocol,
+        methods=_words(methods),
+        views=_numbers(views),
+        jobs=jobs,
+        cases=_words(cases),
+    )
+
+    def progress(done: int, total: int, text: str) -> None:
+        click.echo(f"[{done}/{total}] {text}", err=True)
+
+    rows = evaluation.evaluate(options, None if quiet else progress)
+    click.echo(evaluation_tables.markdown(rows, options.methods[0]))
+
+
+@main.command()
+@click.argument("case_dirs", nargs=-1, type=_FOLDER, required=True)
+@click.option(
+    "--run-option", "extra", multiple=True, help="Passed on to 'gcar run', one word each."
+)
+@click.option("--limit", default=600.0, show_default=True, help="Seconds per case.")
+def score(case_dirs: tuple[Path, ...], extra: tuple[str, ...], limit: float) -> None:
+    """Score ready cases (view*.png, geom.json, truth.nii.gz) through 'gcar run'.
+
+    Example: gcar-export score cases/P_0001 cases/M_0001
+    """
+    from gcar_export import score as scoring
+
+    scores = []
+    for folder in case_dirs:
+        scores.append(scoring.score_case(folder, extra, limit))
+        click.echo(f"[{len(scores)}/{len(case_dirs)}] {folder.name}", err=True)
+    click.echo(scoring.table(scores))
+
+
+@main.command()
+@click.argument("label", type=_FILE)
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--protocol",
+    type=click.Choice(["paper", "clinical", "moved", "raw"]),
+    default="paper",
+    show_default=True,
+)
+@click.option("--views", default=2, show_default=True, help="2 .. 16")
+def simulate(label: Path, out: Path, protocol: str, views: int) -> None:
+    """Make a ready case from a label volume: pictures, geom.json, truth.nii.gz.
+
+    Example: gcar-export simulate data/imagecas/0001.label.nii.gz case --protocol clinical
+    """
+    from gcar_export.labels import read_label
+    from gcar_export.protocols import make_case, write_case
+
+    if out.exists() and any(out.iterdir()):
+        raise UsageError(f"{out} exists and is not empty")
+    for path in write_case(make_case(read_label(label), protocol, views), out):
+        click.echo(path)
+
+
+@main.command("pair-time")
+@click.argument("label", type=_FILE)
+@click.option("--repeats", default=7, show_default=True, help="Timings of each.")
+def pair_time(label: Path, repeats: int) -> None:
+    """Time a warm reconstruction against one itk-rtk forward + back projection.
+
+    128^3 voxels, two 128x128 views, medians of timings taken in turns.
+
+    Example: gcar-export pair-time data/imagecas/0001.label.nii.gz
+    """
+    from gcar_export.labels import read_label
+    from gcar_export.protocols import make_case
+    from gcar_export.rtk_timing import time_pair
+
+    found = time_pair(make_case(read_label(label), "paper"), repeats=repeats)
+    click.echo(f"itk-rtk forward {found.forward_s:.4f} s, back {found.back_s:.4f} s")
+    stages = ", ".join(f"{name} {s:.4f}" for name, s in found.stages_s.items())
+    click.echo(f"warm reconstruction {found.reconstruct_s:.4f} s ({stages})")
+    click.echo(f"ratio {found.ratio:.2f} (medians of {found.repeats})")
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in _words(text))
+    except ValueError:
+        raise UsageError(f"{text!r} is not a comma-separated list of whole numbers") from None

@@ -1,0 +1,1 @@
+"""Networks: the paper's single-view U-Net and the sparse multi-view predictor."""

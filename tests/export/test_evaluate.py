@@ -1,0 +1,269 @@
+import csv
+import json
+import types
+from pathlib import Path
+
+import cv2
+import nibabel
+import numpy as np
+import pytest
+
+from gcar_deploy.errors import RefusedError, UsageError
+from gcar_export import evaluate, evaluation_tables, methods, score
+from gcar_export.labels import read_label
+from gcar_export.protocols import PROTOCOLS, make_case, write_case
+from tests.conftest import data_dir
+
+
+def shared(*parts):
+    for base in (data_dir(), data_dir() / "data"):
+        if base.joinpath(*parts).exists():
+            return base.joinpath(*parts)
+    pytest.skip("GCAR_DATA has no " + "/".join(parts))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two small generated label volumes, each with a left and a right tree."""
+    folder = tmp_path_factory.mktemp("data") / "imagecas"
+    folder.mkdir()
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        volume = np.zeros((120, 100, 100), np.uint8)
+        for x in (25, 90):
+            t = np.linspace(0, 1, 400)
+            line = np.column_stack(
+                [x + 10 * np.sin(3 * t + rng.uniform(0, 3)), 20 + 60 * t, 15 + 70 * t**2]
+            )
+            for dx in range(-2, 3):
+                for dy in range(-2, 3):
+                    for dz in range(-2, 3):
+                        if dx * dx + dy * dy + dz * dz <= 5:
+                            at = np.rint(line + np.array([dx, dy, dz])).astype(int)
+                            volume[tuple(at.T)] = 1
+        affine = np.diag([-0.5, -0.5, 0.5, 1.0])
+        affine[:3, 3] = (30, 25, -25)
+        nibabel.save(nibabel.Nifti1Image(volume, affine), folder / f"{seed}.label.nii.gz")
+    return folder.parent
+
+
+class PerfectEngine:
+    """Stands in for the runtime: returns what a table asks for."""
+
+    answers: dict = {}  # noqa: RUF012
+
+    def __init__(self, *, options=None):
+        self.options = options
+
+    def reconstruct(self, angiograms, grid):
+        return types.SimpleNamespace(
+            volume=self.answers["volume"](len(angiograms)),
+            seconds={"refine": 0.25},
+            counts={"gaussians": 7},
+            quality=types.SimpleNamespace(status="ok", sentence="fine"),
+        )
+
+
+def test_cases_are_consistent(data):
+    label = read_label(data / "imagecas" / "1.label.nii.gz")
+    for protocol in PROTOCOLS:
+        case = make_case(label, protocol)
+        assert len(case.pictures) == len(case.scene.views) == 2
+        assert case.truth.shape == case.grid.shape
+        for view, picture in zip(case.scene.views, case.pictures, strict=True):
+            assert picture.shape == (view.carm.rows, view.carm.columns)
+        mass = case.truth.sum() * np.prod(case.grid.spacing_mm)
+        assert mass == pytest.approx(case.label.volume_mm3, rel=0.01)
+    with pytest.raises(UsageError):
+        make_case(label, "papers")
+    with pytest.raises(UsageError):
+        make_case(label, "paper", views=1)
+
+
+@pytest.mark.parametrize("views", [2, 4, 8, 16])
+def test_paper_views_share_half_a_turn_and_new_ones_lie_between(data, views):
+    case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "paper", views)
+    angles = [v.carm.primary_angle_deg for v in case.scene.views]
+    assert np.allclose(np.diff(angles), 180 / views)
+    new = [c.primary_angle_deg for c in case.new_views]
+    assert np.allclose(np.array(new) - angles, 90 / views)
+
+
+def test_case_folder_round_trip(data, tmp_path):
+    from gcar_deploy.geometry.scene import load_scene
+
+    case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "clinical")
+    write_case(case, tmp_path)
+    scene = load_scene(tmp_path / "geom.json")
+    assert [v.carm for v in scene.views] == case.scene_carms
+    truth = nibabel.load(tmp_path / "truth.nii.gz")
+    assert np.allclose(truth.affine, case.grid.affine_ras())
+
+
+@pytest.mark.parametrize("prefix", ["P", "C", "M"])
+def test_protocols_make_the_ready_cases(prefix):
+    from gcar_deploy.geometry.scene import load_scene
+
+    folder = shared("cases", f"{prefix}_0595")
+    protocol = {"P": "paper", "C": "clinical", "M": "moved"}[prefix]
+    case = make_case(read_label(shared("imagecas", "0595.label.nii.gz")), protocol)
+    scene = load_scene(folder / "geom.json")
+    assert scene.grid == case.grid
+    assert [v.carm for v in scene.views] == case.scene_carms
+    for index, picture in enumerate(case.pictures):
+        ready = cv2.imread(str(folder / f"view{index + 1}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.abs(picture.astype(int) - ready).max() <= 1
+    truth = np.asarray(nibabel.load(folder / "truth.nii.gz").dataobj)
+    assert np.abs(case.truth - truth).max() < 1e-6
+
+
+def test_truth_scores_perfectly_and_a_missing_volume_is_undefined(data):
+    case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "paper")
+    ok = methods.Solved(volume=case.truth, seconds={}, gaussians=None, status="ok", sentence="")
+    found = evaluate.measure(case, ok)
+    assert set(evaluation_tables.MEASURES) <= set(found)
+    assert found["dsc"].value == 1.0
+    assert found["new_dsc"].value > 0.8
+    none = methods.Solved(volume=None, seconds={}, gaussians=None, status="failed", sentence="")
+    assert all(m.value is None and m.reason for m in evaluate.measure(case, none).values())
+
+
+@pytest.fixture
+def engine(monkeypatch, data):
+    module = types.ModuleType("gcar_deploy.engine")
+    module.Engine = PerfectEngine
+    monkeypatch.setitem(__import__("sys").modules, "gcar_deploy.engine", module)
+    monkeypatch.setattr(methods, "run_options", lambda method: method)
+    methods._session.cache_clear()
+    truth = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "paper").truth
+    monkeypatch.setattr(PerfectEngine, "answers", {"volume": lambda views: truth * 0.9})
+    yield PerfectEngine
+    methods._session.cache_clear()
+
+
+def test_evaluation_writes_tables_and_resumes(data, tmp_path, engine, monkeypatch):
+    options = evaluate.EvaluateOptions(
+        data=data, out=tmp_path, protocol="paper", methods=("ours", "visual_hull"), views=(2, 4)
+    )
+    calls = []
+    rows = evaluate.evaluate(options, lambda *a: calls.append(a))
+    assert len(rows) == len(calls) == 8
+    assert calls[-1][:2] == (8, 8)
+    table = list(csv.DictReader((tmp_path / "cases.csv").open()))
+    assert len(table) == 8
+    assert {r["gaussians"] for r in table if r["method"] == "ours"} == {"7"}
+    assert all(r["seconds_refine"] == "0.25" for r in table if r["method"] == "ours")
+    for name in ("summary.json", "wilcoxon.json"):
+        json.loads((tmp_path / name).read_text(), parse_constant=pytest.fail)
+    assert "| ours |" in (tmp_path / "tables.md").read_text()
+    assert not list(tmp_path.glob("rows/*.partial"))
+    # interrupted: one row is gone, only that one is made again
+    (tmp_path / "rows" / "paper-2-4-ours.json").unlink()
+    monkeypatch.setattr(evaluate, "run_job", _counting(evaluate.run_job, calls := []))
+    again = evaluate.evaluate(options)
+    assert len(calls) == 1
+    assert [r["measures"] for r in again] == [r["measures"] for r in rows]
+
+
+def _counting(function, calls):
+    def counted(job):
+        calls.append(job)
+        return function(job)
+
+    return counted
+
+
+def test_refusals_are_rows(data, tmp_path, engine, monkeypatch):
+    def refuse(views):
+        raise RefusedError("no vessel found in view 2")
+
+    monkeypatch.setattr(engine, "answers", {"volume": refuse})
+    options = evaluate.EvaluateOptions(
+        data=data, out=tmp_path, protocol="paper", methods=("ours",), cases=("1",)
+    )
+    (row,) = evaluate.evaluate(options)
+    assert row["status"] == "refused"
+    assert row["measures"]["dsc"] is None
+    assert row["reasons"]["dsc"] == "no prediction"
+    assert "(n=0)" not in evaluation_tables.markdown([row])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"protocol": "x"}, {"methods": ("x",)}, {"methods": ()}, {"views": (1,)}, {"jobs": 0},
+     {"reference": "hull"}],
+)  # fmt: skip
+def test_wrong_options_are_usage_errors(tmp_path, wrong):
+    good = {"data": tmp_path, "out": tmp_path, "protocol": "paper", "methods": ("ours",)}
+    with pytest.raises(UsageError):
+        evaluate.EvaluateOptions(**{**good, **wrong})
+
+
+def test_empty_data_is_a_usage_error(tmp_path):
+    with pytest.raises(UsageError):
+        evaluate.find_labels(tmp_path)
+
+
+def _row(case, method, dsc):
+    measures = dict.fromkeys(evaluation_tables.MEASURES) | {"dsc": dsc}
+    return {
+        "protocol": "paper", "views": 2, "case": case, "method": method, "measures": measures,
+        "gaussians": None, "seconds": 1.0, "stages": {}, "reasons": {},
+    }  # fmt: skip
+
+
+def test_wilcoxon_of_nine_better_cases():
+    rows = [_row(str(k), "a", 0.5 + 0.01 * k) for k in range(9)]
+    rows += [_row(str(k), "b", 0.4 + 0.002 * k) for k in range(9)]
+    (test,) = [t for t in evaluation_tables.paired_tests(rows, "a") if t["measure"] == "dsc"]
+    assert test["p"] == pytest.approx(2 / 2**9)
+    assert (test["n"], test["stars"]) == (9, "**")
+    assert "40.80 ± 0.55**" in evaluation_tables.markdown(rows, "a")
+
+
+def test_undefined_values_are_left_out_and_counted():
+    rows = [_row("1", "a", 0.5), _row("2", "a", None), _row("1", "b", 0.5)]
+    summary = evaluation_tables.summarise(rows)[0]["dsc"]
+    assert summary == {"mean": 0.5, "sd": None, "n": 1}
+    assert "50.00 (n=1)" in evaluation_tables.markdown(rows)
+    tests = evaluation_tables.paired_tests(rows, "a")
+    assert {t["reason"] for t in tests} == {
+        "all differences are zero", "no case on which both are defined",
+    }  # fmt: skip
+
+
+def test_score_refuses_a_folder_that_is_no_case(tmp_path):
+    with pytest.raises(UsageError):
+        score.score_case(tmp_path)
+
+
+def test_score_reads_what_the_command_wrote(data, tmp_path, monkeypatch):
+    case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "clinical")
+    folder = tmp_path / "M_1"
+    write_case(case, folder)
+
+    def command(words, **_):
+        out = Path(words[words.index("--out") + 1])
+        out.mkdir()
+        shifted = np.roll(case.truth, (2, -1, 3), (0, 1, 2))
+        image = nibabel.Nifti1Image(shifted, case.grid.affine_ras())
+        nibabel.save(image, out / "volume.nii.gz")
+        (out / "result.json").write_text('{"status": "ok"}')
+        return types.SimpleNamespace(returncode=0, stderr="")
+
+    monkeypatch.setattr(score.subprocess, "run", command)
+    found = score.score_case(folder)
+    assert found.dsc.value == 1.0
+    assert found.best_dsc.value < 1.0
+    assert "| M_1 | 0 | ok | 100.00 |" in score.table([found])
+
+
+def test_command_line_lists_its_verbs():
+    from click.testing import CliRunner
+
+    from gcar_export.cli import main
+
+    shown = CliRunner().invoke(main, ["--help"]).output
+    for verb in ("evaluate", "score", "simulate", "pair-time"):
+        assert verb in shown
+        assert "Example:" in CliRunner().invoke(main, [verb, "--help"]).output

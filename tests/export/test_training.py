@@ -1,0 +1,114 @@
+"""Scenes, losses, training that resumes to the bit, and the way from checkpoint to ONNX."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from gcar_export.dataset import training_scene
+from gcar_export.export_onnx import export_sparse, load_checkpoint, parity
+from gcar_export.networks.sparse import SparseConfig, SparsePredictor
+from gcar_export.tiny_model import TINY, write_tiny_checkpoint
+from gcar_export.train import PRESETS, TrainOptions, inputs, learning_rate, scene_loss, train
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return [training_scene(7, i) for i in range(3)]
+
+
+def test_scene_is_a_function_of_seed_and_index(scenes):
+    again = training_scene(7, 1)
+    np.testing.assert_array_equal(again.encoded.features, scenes[1].encoded.features)
+    np.testing.assert_array_equal(again.occupancy, scenes[1].occupancy)
+    assert len(training_scene(8, 1).occupancy) != len(again.occupancy)
+
+
+def test_truth_lies_on_the_hull(scenes):
+    for s in scenes:
+        n = s.encoded.features.shape[1]
+        assert s.occupancy.shape == (n,) and s.offset_cells.shape == (n, 3)
+        assert 0.01 < (s.occupancy >= 0.5).mean() < 0.5
+        inside = s.occupancy > 0.9
+        # From a full cell some centreline is about as near as its radius.
+        distance = np.linalg.norm(s.offset_cells[inside], axis=1)
+        assert (distance <= s.radius_cells[inside] + 0.5).mean() > 0.98
+
+
+def test_views_of_the_truth_explain_the_pictures():
+    exact = next(s for s in (training_scene(11, i) for i in range(9)) if "degraded" not in s.kind)
+    e = exact.encoded
+    made = np.bincount(e.ray[0], exact.occupancy * e.weight[0], minlength=e.ray_path.shape[1])
+    assert made.sum() == pytest.approx(e.ray_path[0].sum(), rel=0.35)
+
+
+def test_gather_matmul_backward_equals_autograd(scenes):
+    torch.manual_seed(0)
+    net = SparsePredictor(TINY).double()
+    for p in net.parameters():
+        if p.abs().max() == 0:
+            torch.nn.init.normal_(p, std=0.1)
+    f, ray, path, weight, nb, parent = inputs(scenes[0])
+    grads = []
+    for training in (True, False):
+        net.train(training)
+        net.zero_grad()
+        out = net(f.double(), ray, path.double(), weight.double(), nb, parent)
+        sum(o.square().mean() for o in out).backward()
+        grads.append([p.grad.clone() for p in net.parameters() if p.grad is not None])
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-11)
+
+
+def test_loss_falls_to_nearly_nothing_on_the_truth(scenes):
+    scene = scenes[0]
+    truth = torch.from_numpy(np.clip(scene.occupancy, 1e-4, 1 - 1e-4))
+    perfect = torch.cat([torch.logit(truth)[:, None], torch.from_numpy(scene.offset_cells),
+                         torch.from_numpy(scene.radius_cells)[:, None]], dim=1)
+    wrong = torch.zeros_like(perfect)
+    assert scene_loss([perfect], scene) < 0.35 * scene_loss([wrong], scene)
+
+
+def test_empty_truth_is_no_nan(scenes):
+    nothing = dataclasses.replace(scenes[0], occupancy=np.zeros_like(scenes[0].occupancy))
+    out = torch.zeros(len(nothing.occupancy), 5, requires_grad=True)
+    loss = scene_loss([out], nothing)
+    loss.backward()
+    assert torch.isfinite(loss) and torch.isfinite(out.grad).all()
+
+
+def test_schedule_is_a_function_of_the_step():
+    o = TrainOptions(steps=100, decay_steps=20, warmup_steps=10, learning_rate=1.0)
+    rates = [learning_rate(o, k) for k in (0, 9, 50, 79, 80, 90, 100)]
+    assert rates == pytest.approx([0.1, 1, 1, 1, 1, 0.5, 0])
+
+
+@pytest.mark.slow
+def test_training_resumes_to_the_bit(tmp_path):
+    options = PRESETS["tiny"]
+    train(tmp_path / "whole", options)
+    train(tmp_path / "parts", options, until=0.0)
+    half = dataclasses.replace(options, save_every=1)
+    train(tmp_path / "parts", half, until=1e-9)
+    for _ in range(40):
+        train(tmp_path / "parts", half, until=0.3)
+        if int(load_file(tmp_path / "parts/checkpoint.safetensors")["step"]) == options.steps:
+            break
+    a, b = (load_file(tmp_path / k / "checkpoint.safetensors") for k in ("whole", "parts"))
+    assert a.keys() == b.keys()
+    for key in a:
+        assert torch.equal(a[key], b[key]), key
+
+
+def test_checkpoint_of_another_size_goes_through_export(tmp_path, scenes):
+    checkpoint = write_tiny_checkpoint(tmp_path, seed=3)
+    assert load_checkpoint(checkpoint).config == TINY != SparseConfig()
+    spec = export_sparse(checkpoint, tmp_path / "m.onnx", scenes[0].encoded)
+    assert spec["opset"] == 18 and spec["ir_version"] == 10
+    from gcar_deploy.predict.model_spec import read_model
+
+    assert read_model(tmp_path / "m.onnx").sha256 == spec["sha256"]
+    found = parity(checkpoint, tmp_path / "m.onnx", [s.encoded for s in scenes])
+    assert found.worst < 1e-4 and found.decisions_equal > 0.9999
