@@ -163,3 +163,72 @@ def _numbers(text: str) -> tuple[int, ...]:
         return tuple(int(word) for word in _words(text))
     except ValueError:
         raise UsageError(f"{text!r} is not a comma-separated list of whole numbers") from None
+
+
+@main.command()
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
+@click.option(
+    "--preset", type=click.Choice(["cpu", "gpu", "tiny"]), default="cpu", show_default=True
+)
+@click.option("--steps", type=int, help="Steps in all; overrides the preset.")
+@click.option("--decay-steps", type=int, help="Length of the final linear decay.")
+@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
+def train(
+    out: Path, preset: str, steps: int | None, decay_steps: int | None, minutes: float | None
+) -> None:
+    """Train the multi-view predictor on generated trees; stop and go on at will.
+
+    Example: gcar-export train --out runs/a --minutes 60
+    """
+    from gcar_export.train import start
+
+    start(out, preset, steps=steps, decay_steps=decay_steps, minutes=minutes)
+
+
+@main.command()
+@click.argument("checkpoint", type=_FILE)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
+@click.option("--scenes", default=60, show_default=True, help="Scenes for the parity check.")
+def export(checkpoint: Path, out: Path, scenes: int) -> None:
+    """Turn CHECKPOINT (.safetensors) into one ONNX file with its spec, and prove it.
+
+    Example: gcar-export export runs/a/checkpoint.safetensors --out models/gcp-multi.onnx
+    """
+    from gcar_export.export_onnx import export_checked
+
+    found = export_checked(checkpoint, out, scenes)
+    click.echo(
+        f"{out}: {found.inputs} scenes, largest difference {found.worst:.1e} of the range, "
+        f"{found.decisions_equal:.4%} of decisions equal"
+    )
+
+
+@main.command()
+@click.argument("model", type=_FILE)
+@click.option("--scenes", default=12, show_default=True, help="Generated scenes to run.")
+def verify(model: Path, scenes: int) -> None:
+    """Check a model file against its spec and run it through the runtime's own predictor.
+
+    Example: gcar-export verify models/gcp-multi.onnx
+    """
+    from gcar_export.verify import verify_model
+
+    click.echo(verify_model(model, scenes))
+
+
+@main.command("tree-table")
+@click.option(
+    "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
+)
+@click.option("--count", default=30, show_default=True, help="Generated trees.")
+def tree_table(data: Path | None, count: int) -> None:
+    """Compare generated trees with real ones, figure by figure.
+
+    Example: gcar-export tree-table --data data
+    """
+    from gcar_export.tree_table import generated_statistics, real_statistics, table
+
+    real = sorted((data / "imagecas").glob("*.label.nii.gz")) if data else []
+    with click.progressbar(range(count), label="generated", file=sys.stderr) as seeds:
+        generated = [generated_statistics(seed) for seed in seeds]
+    click.echo(table(generated, [real_statistics(path) for path in real]))

@@ -150,3 +150,30 @@ def parity(checkpoint: Path, model: Path, scenes) -> Parity:
         total += len(a)
         count += 1
     return Parity(count, worst, equal / max(total, 1))
+
+
+#: seed of the scenes that parity is checked on
+PARITY_SEED = 70_001
+
+
+def export_checked(checkpoint: Path, out: Path, scenes: int) -> Parity:
+    """Export, compare on generated scenes and refuse what differs.
+
+    Raises
+    ------
+    ModelError
+        The ONNX file says something else than the checkpoint; the file is taken away.
+    """
+    from gcar_deploy.errors import ModelError
+    from gcar_export.dataset import training_scene
+
+    export_sparse(checkpoint, out, training_scene(PARITY_SEED, 0).encoded)
+    found = parity(checkpoint, out, (training_scene(PARITY_SEED, i).encoded for i in range(scenes)))
+    if found.worst > PARITY or found.decisions_equal < 0.9999:
+        for path in (out, out.with_suffix(".json")):
+            path.unlink(missing_ok=True)
+        raise ModelError(
+            f"{out.name} differs from its checkpoint by {found.worst:.1e} of the range "
+            f"(at most {PARITY:g}); {found.decisions_equal:.4%} of decisions equal"
+        )
+    return found

@@ -271,21 +271,18 @@ def _checkpoint(out, net, optimiser, step, options, losses, scores) -> None:
         (out / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
 
 
-@click.command()
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
-@click.option("--preset", type=click.Choice(sorted(PRESETS)), default="cpu", show_default=True)
-@click.option("--steps", type=int, help="Scenes in all; overrides the preset.")
-@click.option("--decay-steps", type=int, help="Length of the final linear decay.")
-@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
-def main(out: Path, preset: str, steps, decay_steps, minutes) -> None:
-    """Train the multi-view predictor on generated trees; stop and go on at will."""
+def start(
+    out: Path,
+    preset: str,
+    *,
+    steps: int | None = None,
+    decay_steps: int | None = None,
+    minutes: float | None = None,
+) -> None:
+    """Train with a preset, some of its numbers replaced."""
     options = PRESETS[preset]
     if steps:
         options = dataclasses.replace(options, steps=steps)
     if decay_steps:
         options = dataclasses.replace(options, decay_steps=decay_steps)
     train(out, options, until=minutes * 60 if minutes else None)
-
-
-if __name__ == "__main__":
-    main()

@@ -125,10 +125,7 @@ def check_consistency(
     """
     findings = []
     for view, value in zip(views, disagreement, strict=True):
-        calibrated = view.calibrated and views[0].calibrated
-        good, most = options.good_disagreement, options.max_disagreement
-        if not calibrated:
-            good, most = options.good_disagreement_raw, options.max_disagreement_raw
+        good, most = _disagreement_limits([views[0], view], options)
         if value > most:
             raise RefusedError(
                 f"views {views[0].view_id} and {view.view_id} contradict each other: the vessels "
@@ -157,6 +154,14 @@ def check_candidates(count: int, lattice: Grid, options: QualityOptions) -> None
             f"only {count} points of {cell:.2g} mm inside the volume are seen as vessel by all "
             "views; do the views show one tree, and does the volume hold it?"
         )
+
+
+def _disagreement_limits(
+    views: Sequence[VesselImage], options: QualityOptions
+) -> tuple[float, float]:
+    if all(view.calibrated for view in views):
+        return options.good_disagreement, options.max_disagreement
+    return options.good_disagreement_raw, options.max_disagreement_raw
 
 
 def check_tree(tree: Tree, options: QualityOptions) -> None:
@@ -199,9 +204,16 @@ def assess(
     """
     findings = list(findings)
     judged = []
+    doubtful = (disagreement or 0.0) > _disagreement_limits(views, options)[0]
     for view, inside in zip(views, lumen, strict=True):
         one = view_quality(tree, view, inside, options)
         judged.append(one)
+        if doubtful and (one.coverage or 0.0) < options.good_coverage:
+            raise RefusedError(
+                f"the views contradict each other: {disagreement:.0%} of the vessels differ along "
+                f"the epipolar lines, and no tree explains more than {one.coverage or 0.0:.0%} of "
+                f"view {view.view_id}; different patients, frames or angles?"
+            )
         for value, least, good, what in (
             (one.coverage, options.min_coverage, options.good_coverage,
              "of the picture's vessels are explained by the tree"),

@@ -300,8 +300,9 @@ class CArm:
         pixels = np.asarray(pixels, dtype=np.float64)
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
         # Depth along P's third row is +1 for each of these, so they point at the detector.
-        directions: Array = np.linalg.solve(self.world2pixel[:, :3], homogeneous.T).T
-        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = np.linalg.solve(self.world2pixel[:, :3], homogeneous.T).T
+        unit: Array = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        return unit
 
     def backproject(self, pixels: Pixels, depth_mm: Scalars) -> Points:
         """(n, 3) points, mm LPS, at (n, 2) pixels and depths (n,) as ``project`` gives them."""
@@ -309,7 +310,8 @@ class CArm:
         depth = np.asarray(depth_mm, dtype=np.float64)
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))]) * depth[:, None]
         P = self.world2pixel
-        return np.linalg.solve(P[:, :3], homogeneous.T - P[:, 3:]).T
+        points: Array = np.linalg.solve(P[:, :3], homogeneous.T - P[:, 3:]).T
+        return points
 
     # -- neighbours of this value ---------------------------------------------------------
 

@@ -123,10 +123,7 @@ def geometry_sigmas(
     steps = [
         (prior.angle_deg, lambda c, s: c.turned(primary_deg=s)),
         (prior.angle_deg, lambda c, s: c.turned(secondary_deg=s)),
-        *[
-            (prior.offset_mm, lambda c, s, k=k: c.moved(np.eye(3)[k] * s))
-            for k in range(3)
-        ],
+        *[(prior.offset_mm, lambda c, s, k=k: c.moved(np.eye(3)[k] * s)) for k in range(3)],
     ]
     for k in range(1, len(carms)):
         for size, change in steps:

@@ -48,23 +48,47 @@ class Pieces:
     share: Scalars
 
 
-def chosen_tree(
-    tree: Tree, start_radius: Scalars, targets: list[Target], options: TubeOptions
-) -> Tree:
-    """Drop the pieces that pictures and evidence do not want.
+def kept_tree(tree: Tree, pieces: Pieces, options: TubeOptions) -> Tree:
+    """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
+    return _kept(tree, tubes_of(tree), pieces, options)
+
+
+def reinstated(
+    tree: Tree,
+    pieces: Pieces,
+    start_radius: Scalars,
+    targets: list[Target],
+    left: list[Array],
+    options: TubeOptions,
+) -> Pieces:
+    """Take back dropped pieces that every view misses after all.
+
+    Vessels that overlap each other in all views seem too thick alone, and the shares may call
+    one of them a ghost; once the others are fitted without it, its path is missing.
 
     Parameters
     ----------
-    tree : Tree, already drawn to the pictures
-    start_radius : (n,) radius of each branch point by the starting points, mm
+    tree : Tree before any piece was dropped
+    pieces : Pieces of it
+    start_radius : (n,) radius of its branch points by the starting points, mm
     targets : one per view
+    left : per view (rows, cols), path that the kept pieces leave unexplained, mm
     options : TubeOptions
     """
-    if len(targets) < 2 or not tree.branches:
-        return tree
-    tubes = tubes_of(tree)
-    pieces = weigh_pieces(tree, tubes, start_radius, targets, options)
-    return _kept(tree, tubes, pieces, options)
+    tubes = dataclasses.replace(tubes_of(tree), log_radius=np.log(start_radius))
+    dropped = pieces.share < options.min_share
+    found = np.where(dropped, np.inf, 0.0)
+    count = len(pieces.share)
+    for target, rest in zip(targets, left, strict=True):
+        seen = footprint(tubes, target.carm, target.box_px)
+        piece = pieces.segment[seen.segment]
+        claim = np.minimum(rest.reshape(-1)[seen.pixel], seen.path_mm)
+        whole = np.bincount(piece, seen.path_mm, minlength=count)
+        share = np.bincount(piece, claim, minlength=count) / np.maximum(whole, 1e-9)
+        found = np.minimum(found, share)
+    return dataclasses.replace(
+        pieces, share=np.where(found >= options.missed_share, 1.0, pieces.share)
+    )
 
 
 def weigh_pieces(
@@ -79,10 +103,12 @@ def weigh_pieces(
     count = int(segment.max()) + 1
     points = tubes.points_mm
     length = np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1)
-    total = np.bincount(segment, length, minlength=count)
+    total: Scalars = np.bincount(segment, length, minlength=count).astype(np.float64)
     trust = np.concatenate([branch.confidence for branch in tree.branches])
     own = 0.5 * (trust[tubes.first] + trust[tubes.second])
-    confidence = np.bincount(segment, own * length, minlength=count) / np.maximum(total, 1e-9)
+    confidence: Scalars = np.bincount(segment, own * length, minlength=count) / np.maximum(
+        total, 1e-9
+    )
     # Vessels that overlap each other in every view would all seem thick: the points say less.
     radius = np.minimum(radius_alone(tubes, targets), options.piece_growth * start_radius)
     alone = dataclasses.replace(tubes, log_radius=np.log(radius))

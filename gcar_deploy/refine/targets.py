@@ -11,7 +11,7 @@ import numpy as np
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.types import Array, Image
+from gcar_deploy.types import Array
 
 #: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
 COARSE_BLUR_PX = 0.6
@@ -36,7 +36,7 @@ class Target:
     """
 
     carm: CArm
-    path_mm: Image
+    path_mm: Array
     weight: Array
     sigma_mm: Array
     box_px: float
@@ -44,7 +44,7 @@ class Target:
     calibrated: bool = True
     contrast: float = 1.0
 
-    def with_contrast(self, model: Image) -> Target:
+    def with_contrast(self, model: Array) -> Target:
         """Fit the contrast factor to a model picture by least squares (variable projection)."""
         if self.calibrated:
             return self

@@ -10,7 +10,7 @@ import numpy as np
 from gcar_deploy.config import TreeOptions, TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.refine.choose import chosen_tree
+from gcar_deploy.refine.choose import kept_tree, reinstated, weigh_pieces
 from gcar_deploy.refine.settle import settled
 from gcar_deploy.refine.support import grown_tree, seen_share, supported_tree, unexplained
 from gcar_deploy.refine.targets import Target, make_targets
@@ -26,6 +26,7 @@ from gcar_deploy.refine.tube_prior import Prior, make_prior
 from gcar_deploy.refine.uncertainty import fit_sigma, geometry_sigma
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Scalars
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +70,7 @@ def fit_tubes(
     tree = build_tree(settled_centers, tree_options)
     contrast = (1.0,) * len(views)
     if tree.branches:
-        tree, contrast = _fitted(tree, views, options, progress, should_stop)
+        tree, contrast = _fitted(tree, views, _Run(options, progress, should_stop))
     return TubeFit(
         tree=tree,
         centers=settled_centers,
@@ -79,31 +80,42 @@ def fit_tubes(
     )
 
 
-def _fitted(
-    tree: Tree,
-    views: Sequence[VesselImage],
-    options: TubeOptions,
-    progress: Progress,
-    should_stop: Callable[[], bool] | None,
-) -> tuple[Tree, tuple[float, ...]]:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Run:
+    """What every stage of one fit shares."""
+
+    options: TubeOptions
+    progress: Progress
+    should_stop: Callable[[], bool] | None
+
+    def fit(self, tree: Tree, targets: list[Target], steps: int) -> tuple[Tree, Tubes, Prior]:
+        """Fit from where the tree is now."""
+        tubes, prior = _start(tree, self.options)
+        if tree.branches:
+            tubes = fit_level(
+                tubes, targets, prior, self.options, steps, self.progress, self.should_stop
+            )
+        return tree_of(tubes, tree), tubes, prior
+
+
+def _fitted(tree: Tree, views: Sequence[VesselImage], run: _Run) -> tuple[Tree, tuple[float, ...]]:
+    options = run.options
     targets: list[Target] = []
     start_radius = tree.radii()
     tubes, prior = _start(tree, options)
     for number, (level, steps) in enumerate(zip(options.levels_mm, options.steps, strict=True)):
-        if progress.stopped or progress.failed:
+        if run.progress.stopped or run.progress.failed:
             break
         targets = _contrasts(make_targets(views, level, options), targets)
-        tubes = fit_level(tubes, targets, prior, options, steps, progress, should_stop)
+        tubes = fit_level(tubes, targets, prior, options, steps, run.progress, run.should_stop)
         tree = tree_of(tubes, tree)
         if number or len(options.levels_mm) == 1:
             continue
-        if options.min_share > 0:
-            seen = rescaled(targets, footprints(tubes, targets))
-            tree = chosen_tree(tree, start_radius, seen, options)
-            tree, tubes, prior = _refit(tree, targets, options, steps // 2, progress, should_stop)
+        if options.min_share > 0 and len(targets) > 1:
+            tree, tubes, prior = _chosen(tree, tubes, start_radius, targets, run)
         if tree.branches:
             tree = _supported(tree, tubes, targets, options)
-            tree, tubes, prior = _refit(tree, targets, options, steps // 2, progress, should_stop)
+            tree, tubes, prior = run.fit(tree, targets, steps // 2)
         if not tree.branches:
             return tree, tuple(target.contrast for target in targets)
     targets = rescaled(targets, footprints(tubes, targets))
@@ -126,19 +138,20 @@ def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
     ]
 
 
-def _refit(
-    tree: Tree,
-    targets: list[Target],
-    options: TubeOptions,
-    steps: int,
-    progress: Progress,
-    should_stop: Callable[[], bool] | None,
+def _chosen(
+    tree: Tree, tubes: Tubes, start_radius: Scalars, targets: list[Target], run: _Run
 ) -> tuple[Tree, Tubes, Prior]:
-    """Fit again after the topology changed, from where the tree is now."""
-    tubes, prior = _start(tree, options)
-    if tree.branches:
-        tubes = fit_level(tubes, targets, prior, options, steps, progress, should_stop)
-    return tree_of(tubes, tree), tubes, prior
+    """Drop ghosts, fit the rest, and take back what every view then misses."""
+    options = run.options
+    targets = rescaled(targets, footprints(tubes, targets))
+    pieces = weigh_pieces(tree, tubes, start_radius, targets, options)
+    steps = options.steps[0] // 2
+    kept, tubes, prior = run.fit(kept_tree(tree, pieces, options), targets, steps)
+    left = unexplained(targets, footprints(tubes, targets))
+    back = reinstated(tree, pieces, start_radius, targets, left, options)
+    if np.array_equal(back.share, pieces.share):
+        return kept, tubes, prior
+    return run.fit(kept_tree(tree, back, options), targets, steps)
 
 
 def _supported(tree: Tree, tubes: Tubes, targets: list[Target], options: TubeOptions) -> Tree:
@@ -169,7 +182,9 @@ def with_sigma(
     """Return the tree with sigma per point: fit and geometry prior, in quadrature."""
     prints = footprints(tubes, targets)
     hessian, _ = normal_equations(tubes, targets, prints, prior, options)
-    own = fit_sigma(hessian, tubes.owner, len(tubes.positions_mm))[tubes.owner]
+    tangents = np.zeros_like(tubes.positions_mm)
+    tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
+    own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]
     geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets], options)
     sigma = np.sqrt(own**2 + geometry**2)
     branches = [

@@ -18,7 +18,7 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Array, Image, Points, Scalars
+from gcar_deploy.types import Array, Points, Scalars
 
 #: a tube seen this much end-on is treated as if at this sine of the angle to the ray.
 MIN_SINE = 0.2
@@ -113,7 +113,7 @@ class Footprint:
     crossings: Array
     pairing: Pairing
 
-    def image(self, shape: tuple[int, int]) -> Image:
+    def image(self, shape: tuple[int, int]) -> Array:
         """(rows, cols) float64 path length, mm."""
         total = np.bincount(self.pixel, self.path_mm, minlength=shape[0] * shape[1])
         return total.reshape(shape)

@@ -24,15 +24,18 @@ CORRELATED_PIXELS = 4.0
 RELATIVE_CUT = 1e-6
 
 
-def fit_sigma(hessian: sparse.csc_matrix, owner: Array, positions: int) -> Scalars:
-    """(p,) largest standard deviation of each position by the inverse Hessian, mm.
+def fit_sigma(hessian: sparse.csc_matrix, owner: Array, tangents: Points) -> Scalars:
+    """(p,) largest standard deviation of each position across its vessel, mm.
+
+    Along the vessel a point may slide without changing the tube, so that direction is left out.
 
     Parameters
     ----------
     hessian : (3 p + n, 3 p + n) sparse
     owner : (n,) position of each branch point, in order along the branches
-    positions : int, p
+    tangents : (p, 3) unit vector along the vessel at each position
     """
+    positions = len(tangents)
     if not positions:
         return np.zeros(0)
     factor = splu(hessian.tocsc(), permc_spec="MMD_AT_PLUS_A")
@@ -43,6 +46,9 @@ def fit_sigma(hessian: sparse.csc_matrix, owner: Array, positions: int) -> Scala
     inverse = factor.solve(rhs)
     blocks = inverse[(3 * chosen[:, None] + np.arange(3))].reshape(len(chosen), 3, len(chosen), 3)
     own = blocks[np.arange(len(chosen)), :, np.arange(len(chosen))]
+    t = tangents[chosen]
+    across = np.eye(3) - t[:, :, None] * t[:, None, :]
+    own = across @ own @ across
     largest = np.linalg.eigvalsh(0.5 * (own + np.swapaxes(own, 1, 2)))[:, -1]
     sigma = np.sqrt(np.maximum(largest, 0.0) * CORRELATED_PIXELS)
     # Along the order of the branch points, every position is next to a solved one.

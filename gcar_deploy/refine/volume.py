@@ -168,7 +168,9 @@ def _pictures(
     """Projector, path that the tubes leave unexplained, and its variance, per view."""
     tubes = tubes_of(tree)
     h = float(grid.spacing_mm.mean())
-    operators, errors, variances = [], [], []
+    operators: list[sparse.csr_matrix] = []
+    errors: list[Scalars] = []
+    variances: list[Scalars] = []
     for view, factor in zip(views, contrast, strict=True):
         if not view.calibrated:
             continue
@@ -179,7 +181,7 @@ def _pictures(
         rest = shrunk(view.carm, rest.astype(np.float32), h)[1]
         operators.append(cells.matrix)
         errors.append(rest.reshape(-1)[cells.pixel].astype(np.float64))
-        path = cells.path_mm.reshape(-1)[cells.pixel]
+        path = cells.path_mm.reshape(-1)[cells.pixel].astype(np.float64)
         variances.append((options.noise_mm + options.noise_share * path) ** 2)
     return operators, errors, variances
 

@@ -65,8 +65,14 @@ def test_gather_matmul_backward_equals_autograd(scenes):
 def test_loss_falls_to_nearly_nothing_on_the_truth(scenes):
     scene = scenes[0]
     truth = torch.from_numpy(np.clip(scene.occupancy, 1e-4, 1 - 1e-4))
-    perfect = torch.cat([torch.logit(truth)[:, None], torch.from_numpy(scene.offset_cells),
-                         torch.from_numpy(scene.radius_cells)[:, None]], dim=1)
+    perfect = torch.cat(
+        [
+            torch.logit(truth)[:, None],
+            torch.from_numpy(scene.offset_cells),
+            torch.from_numpy(scene.radius_cells)[:, None],
+        ],
+        dim=1,
+    )
     wrong = torch.zeros_like(perfect)
     assert scene_loss([perfect], scene) < 0.35 * scene_loss([wrong], scene)
 

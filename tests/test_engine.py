@@ -1,0 +1,146 @@
+"""Engine: inputs of every kind, the same bytes in every thread, progress, deadline, cancel."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import json
+import threading
+
+import numpy as np
+import pytest
+
+from gcar_deploy import CArm, Engine, Result, RunOptions
+from gcar_deploy.config import PredictOptions
+from gcar_deploy.errors import CancelledError, GeometryError, ImageError, ModelError, UsageError
+from gcar_deploy.geometry.scene import Scene, View, scene_to_json
+from gcar_deploy.selftest import tiny_case
+
+HULL = RunOptions(predict=PredictOptions(predictor="none"))
+
+
+@pytest.fixture(scope="module")
+def case():
+    angiograms, grid, _ = tiny_case()
+    views = tuple(View(id=a.view_id, carm=a.carm, intensity=a.intensity) for a in angiograms)
+    return angiograms, grid, Scene(views=views, grid=grid)
+
+
+@pytest.fixture(scope="module")
+def engine():
+    return Engine(options=HULL)
+
+
+def content(result: Result) -> bytes:
+    parts = [result.volume, result.tree.points(), result.tree.radii(), result.gaussians.means_mm]
+    return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+
+
+def test_arrays_with_a_scene_a_dict_or_a_file_give_one_result(case, engine, tmp_path):
+    angiograms, grid, scene = case
+    arrays = [a.pixels.astype(np.uint16) for a in angiograms]
+    file = tmp_path / "geom.json"
+    file.write_text(scene_to_json(scene))
+    whole = content(engine.reconstruct(angiograms, grid))
+    for geometry in (scene, json.loads(scene_to_json(scene)), file, str(file)):
+        assert content(engine.reconstruct(arrays, geometry)) == whole
+
+
+def test_threads_share_one_engine_and_agree_to_the_byte(case, engine):
+    angiograms, grid, _ = case
+    alone = content(engine.reconstruct(angiograms, grid))
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        runs = [pool.submit(engine.reconstruct, angiograms, grid) for _ in range(8)]
+        assert {content(run.result()) for run in runs} == {alone}
+
+
+def test_progress_rises_from_stage_to_stage(case, engine):
+    angiograms, grid, _ = case
+    seen = []
+    engine.reconstruct(angiograms, grid, on_progress=lambda *step: seen.append(step))
+    shares = [share for _, share in seen]
+    assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == pytest.approx(1.0)
+    assert {"vessels", "candidates", "refine", "tree"} <= {stage for stage, _ in seen}
+
+
+def test_cancel_ends_within_a_stage(case, engine):
+    angiograms, grid, _ = case
+    flag = threading.Event()
+    stages = []
+
+    def stop_at_refine(stage, _):
+        stages.append(stage)
+        if stage == "refine":
+            flag.set()
+
+    with pytest.raises(CancelledError, match="cancelled"):
+        engine.reconstruct(angiograms, grid, on_progress=stop_at_refine, cancel=flag.is_set)
+    assert "quality" not in stages
+
+
+def test_a_deadline_before_any_result_is_an_error(case, engine):
+    angiograms, grid, _ = case
+    with pytest.raises(CancelledError, match="deadline"):
+        engine.reconstruct(angiograms, grid, deadline_s=1e-9)
+
+
+def test_result_as_json_and_folder(case, engine, tmp_path):
+    angiograms, grid, _ = case
+    result = engine.reconstruct(angiograms, grid)
+    assert json.loads(result.to_json())["status"] == result.status
+    assert result.save(tmp_path / "out") == tmp_path / "out"
+    assert (tmp_path / "out" / "result.json").is_file()
+    assert (
+        result.seconds["total"] >= sum(v for k, v in result.seconds.items() if k != "total") - 0.01
+    )
+
+
+def test_nothing_is_printed(case, engine, capfd):
+    angiograms, grid, _ = case
+    engine.warmup()
+    engine.reconstruct(angiograms, grid)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.zeros((96, 96), np.int32), "int32"),
+        (np.zeros((96, 96, 3), np.uint8), "3 dimensions"),
+        (np.full((96, 96), np.nan, np.float32), "finite"),
+        (np.full((96, 96), -1.0), "negative"),
+        (np.zeros((1, 1), np.uint8), "1 x 1"),
+    ],
+)
+def test_unfit_arrays(case, engine, array, words):
+    angiograms, _, scene = case
+    with pytest.raises(ImageError, match=words):
+        engine.reconstruct([angiograms[0].pixels, array], scene)
+
+
+def test_wrong_calls(case, engine, tmp_path):
+    angiograms, grid, scene = case
+    with pytest.raises(UsageError, match="two or more"):
+        engine.reconstruct(angiograms[:1], grid)
+    with pytest.raises(GeometryError, match="3 pictures"):
+        engine.reconstruct([*angiograms, angiograms[0]], scene)
+    with pytest.raises(UsageError, match="Grid alone"):
+        engine.reconstruct([a.pixels for a in angiograms], grid)
+    with pytest.raises(UsageError, match="deadline_s"):
+        engine.reconstruct(angiograms, grid, deadline_s=0)
+    with pytest.raises(UsageError, match="threads"):
+        Engine(options=HULL, threads=0)
+    with pytest.raises(ModelError):
+        Engine(tmp_path / "none.onnx")
+
+
+def test_a_moved_patient_is_noticed(case, engine):
+    angiograms, grid, _ = case
+    second: CArm = angiograms[1].carm.moved((0.0, 0.0, 3.0))
+    moved = [angiograms[0], dataclasses.replace(angiograms[1], carm=second)]
+    result = engine.reconstruct(moved, grid)
+    along = result.poses[1].offset_mm[2]
+    assert along < -1.0
+    assert json.loads(result.to_json())["views"][1]["estimated_offset_mm"][2] == pytest.approx(
+        along
+    )
