@@ -275,11 +275,12 @@ class QualityOptions:
     #: 0.01 to 0.02 between path-length views of one tree, from 0.11 between those of two
     good_disagreement: float = 0.05
     max_disagreement: float = 0.09
-    #: the same where vessels had to be found in raw pictures, which adds errors of its own:
-    #: mostly below 0.11 for one tree, from 0.12 for two; between the two figures the pictures
-    #: contradict each other if the tree also leaves vessels of either unexplained
+    #: the same where vessels had to be found in raw pictures, which adds errors of its own: nine
+    #: simulated raw pairs of one tree lie at 0.06 .. 0.48 and overlap with those of two trees
+    #: (0.14 .. 0.58), so between these figures the finished tree decides: it leaves more than a
+    #: tenth of the vessels of a view unexplained in all nine pairs of two trees, in one of one
     good_disagreement_raw: float = 0.11
-    max_disagreement_raw: float = 0.16
+    max_disagreement_raw: float = 0.6
     #: share of a view's skeleton that the reprojected tree explains
     good_coverage: float = 0.9
     min_coverage: float = 0.3

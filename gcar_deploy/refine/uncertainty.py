@@ -19,7 +19,7 @@ from gcar_deploy.types import Array, Points, Scalars
 EVERY = 3
 #: model error (sections that are not round, overlaps) makes neighbouring pixels err together;
 #: the pictures count as if they had so many times fewer independent pixels.
-CORRELATED_PIXELS = 4.0
+CORRELATED_PIXELS = 6.0
 #: smallest eigenvalue of the normal matrix, relative to the largest, that counts as seen.
 RELATIVE_CUT = 1e-6
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TreeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.tree.tree import Branch, Tree, empty_tree
 from gcar_deploy.types import Array, Points, Scalars
 
 
@@ -26,6 +26,8 @@ def draw_branches(
     centers : CenterPoints, for centroid and cross-section area
     options : TreeOptions
     """
+    if not paths:
+        return empty_tree()
     pieces = _split(paths)
     keys = sorted({int(end) for piece in pieces for end in (piece[0], piece[-1])})
     number = {key: i for i, key in enumerate(keys)}

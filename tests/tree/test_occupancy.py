@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.tree.occupancy import sparse_occupancy, tree_occupancy
+from gcar_deploy.tree.tree import Tree, empty_tree
+from tests.tree.shapes import branch, fork, grid, tube
+
+
+def slow_occupancy(tree, where, samples=8):
+    """Count sub-samples inside any capsule: the obvious, slow way."""
+    step = (np.arange(samples) + 0.5) / samples - 0.5
+    offsets = np.stack(np.meshgrid(step, step, step, indexing="ij"), -1).reshape(-1, 3)
+    index = np.stack(np.unravel_index(np.arange(np.prod(where.shape)), where.shape), 1)
+    total = np.zeros(len(index))
+    a, b, ra, rb = tree.segments()
+    for offset in offsets:
+        points = where.index2world(index + offset)
+        inside = np.zeros(len(points), bool)
+        for k in range(len(a)):
+            axis = b[k] - a[k]
+            t = np.clip((points - a[k]) @ axis / (axis @ axis), 0, 1)
+            far = np.linalg.norm(points - a[k] - t[:, None] * axis, axis=1)
+            inside |= far < ra[k] + t * (rb[k] - ra[k])
+        total += inside
+    return (total / len(offsets)).reshape(where.shape)
+
+
+@pytest.mark.parametrize("radius", [0.4, 0.8, 1.7, 3.2])
+def test_matches_the_slow_twin(radius):
+    where = grid(16)
+    tree = Tree(
+        nodes_mm=np.array([[-4.0, -3, -5], [4, 3.3, 5]]),
+        branches=(
+            branch([[-4, -3, -5], [0.3, 0.1, 0], [4, 3.3, 5]], [radius, radius, radius / 2]),
+        ),
+    )
+    fast, slow = tree_occupancy(tree, where), slow_occupancy(tree, where)
+    assert np.abs(fast - slow).max() < 0.09
+    assert np.sqrt(np.mean((fast - slow)[(slow > 0) & (slow < 1)] ** 2)) < 0.02
+    assert abs(fast.sum() / slow.sum() - 1) < 0.015
+
+
+def test_volume_of_a_tube():
+    tree = tube(length=30, radius=2)
+    expected = np.pi * 4 * 30 + 4 / 3 * np.pi * 8
+    assert tree_occupancy(tree, grid(64)).sum() == pytest.approx(expected, rel=0.01)
+
+
+def test_joined_branches_are_a_union():
+    volume = tree_occupancy(fork(), grid(64))
+    assert volume.max() == 1.0
+    assert volume.min() == 0.0
+
+
+def test_oblong_voxels_and_tubes_outside():
+    where = Grid(center_mm=(0, 0, 0), size_mm=(40, 20, 30), shape=(40, 10, 60))
+    volume = tree_occupancy(tube(length=100, radius=2), where)
+    assert volume.sum() * np.prod(where.spacing_mm) == pytest.approx(np.pi * 4 * 30, rel=0.02)
+    away = Grid(center_mm=(500, 0, 0), size_mm=(10, 10, 10), shape=(10, 10, 10))
+    assert not tree_occupancy(tube(), away).any()
+
+
+def test_empty_tree():
+    assert not tree_occupancy(empty_tree(), grid(8)).any()
+    assert len(sparse_occupancy(empty_tree(), grid(8))[0]) == 0
