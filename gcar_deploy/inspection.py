@@ -112,14 +112,13 @@ def volume_coverage(carm: CArm, grid: Grid) -> float:
 
 
 def _consistency(found: Inspection, views: Sequence[VesselImage], options: RunOptions) -> list[str]:
-    for k in range(len(views) - 1):
-        first = views[k]
-        for view, pose in zip(views[k + 1 :], poses_between(views[k:], options)[1:], strict=True):
-            pair = next(
-                p for p in found.pairs if (p["first"], p["second"]) == (first.view_id, view.view_id)
-            )
-            pair["disagreement"] = pose.before
-            pair["shift_mm"] = float(np.linalg.norm(pose.offset_mm))
-            pair["after_shift"] = pose.after
-    after = [0.0] + [p["after_shift"] for p in found.pairs if p["first"] == views[0].view_id]
-    return check_consistency(views, after, options.quality)
+    poses = poses_between(views, options)
+    for k, pose in enumerate(poses):
+        both = {views[pose.partner].view_id, views[k].view_id}
+        for pair in found.pairs:
+            if {pair["first"], pair["second"]} == both:
+                pair["disagreement"] = pose.before
+                pair["shift_mm"] = float(np.linalg.norm(pose.offset_mm))
+                pair["after_shift"] = pose.after
+    after, partners = [p.after for p in poses], [p.partner for p in poses]
+    return check_consistency(views, after, options.quality, partners)

@@ -109,14 +109,18 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
 
 
 def check_consistency(
-    views: Sequence[VesselImage], disagreement: Sequence[float], options: QualityOptions
+    views: Sequence[VesselImage],
+    disagreement: Sequence[float],
+    options: QualityOptions,
+    partners: Sequence[int] | None = None,
 ) -> list[str]:
     """Judge whether the views can show one tree.
 
     Parameters
     ----------
     views : V vessel images
-    disagreement : (V,) of each view's epipolar profile with the first view's, 0 .. 1
+    disagreement : (V,) of each view's epipolar profile with its partner's, 0 .. 1
+    partners : (V,) which view each was compared with; the first where left out
 
     Raises
     ------
@@ -124,17 +128,18 @@ def check_consistency(
         The views contradict each other.
     """
     findings = []
-    for view, value in zip(views, disagreement, strict=True):
-        good, most = _disagreement_limits([views[0], view], options)
+    for k, (view, value) in enumerate(zip(views, disagreement, strict=True)):
+        other = views[partners[k] if partners else 0]
+        good, most = _disagreement_limits([other, view], options)
         if value > most:
             raise RefusedError(
-                f"views {views[0].view_id} and {view.view_id} contradict each other: the vessels "
+                f"views {other.view_id} and {view.view_id} contradict each other: the vessels "
                 f"differ by {value:.0%} along the epipolar lines (at most {most:.0%}); "
                 "different patients, frames or angles?"
             )
         if value > good:
             findings.append(
-                f"view {view.view_id} agrees poorly with view {views[0].view_id}: {value:.0%} of "
+                f"view {view.view_id} agrees poorly with view {other.view_id}: {value:.0%} of "
                 "the vessel differs along the epipolar lines"
             )
     return findings

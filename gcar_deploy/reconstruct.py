@@ -79,7 +79,9 @@ def reconstruct(
         views = _vessels(angiograms, options, report)
     with watch.stage("pose"):
         poses = poses_between(views, options)
-        findings += quality.check_consistency(views, [p.after for p in poses], options.quality)
+        findings += quality.check_consistency(
+            views, [p.after for p in poses], options.quality, [p.partner for p in poses]
+        )
         views = [_posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
         lattice = cubic_lattice(grid, cell_mm(grid, options))

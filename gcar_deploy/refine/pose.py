@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from gcar_deploy.config import PoseOptions
-from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
 from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.types import Array, Image
@@ -32,6 +32,8 @@ class Pose:
     primary_deg, secondary_deg : float, correction of the angles
     before, after : float
         Disagreement of the two mass profiles, 0 (equal) .. 1 (nothing in common).
+    partner : int
+        View that this one was compared with; itself where there was none to compare with.
     """
 
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -39,6 +41,7 @@ class Pose:
     secondary_deg: float = 0.0
     before: float = 0.0
     after: float = 0.0
+    partner: int = 0
 
     def applied(self, carm: CArm) -> CArm:
         """Return the view with the correction built in."""
@@ -46,7 +49,11 @@ class Pose:
 
 
 def estimate_poses(views: Sequence[tuple[CArm, Image]], options: PoseOptions) -> tuple[Pose, ...]:
-    """Estimate the correction of every view against the first.
+    """Estimate the correction of every view against the first, directly or through others.
+
+    Each view is compared with that of those already placed whose direction is nearest to 90 deg
+    from its own. Nearly opposite views cannot be compared: the line through both sources runs
+    through the picture, and planes about it cut no slices.
 
     Parameters
     ----------
@@ -59,7 +66,22 @@ def estimate_poses(views: Sequence[tuple[CArm, Image]], options: PoseOptions) ->
     tuple of Pose, the first of them zero
     """
     masses = [vessel_mass(carm, path) for carm, path in views]
-    return (Pose(), *(_estimate(masses[0], moving, options) for moving in masses[1:]))
+    poses = {0: Pose()}
+    while len(poses) < len(views):
+        left = [k for k in range(len(views)) if k not in poses]
+        _, k, partner = min(
+            (abs(separation_deg(views[j][0], views[k][0]) - 90.0), k, j)
+            for k in left
+            for j in poses
+        )
+        placed = masses[partner]
+        apart = separation_deg(views[partner][0], views[k][0])
+        if placed is None or apart > options.most_apart_deg:
+            poses[k] = Pose(partner=k)
+            continue
+        fixed = dataclasses.replace(placed, carm=poses[partner].applied(placed.carm))
+        poses[k] = dataclasses.replace(_estimate(fixed, masses[k], options), partner=partner)
+    return tuple(poses[k] for k in range(len(views)))
 
 
 def _estimate(fixed: Mass | None, moving: Mass | None, options: PoseOptions) -> Pose:
