@@ -1,0 +1,86 @@
+"""gcar validate: what is said before any reconstruction, and the exit code that run would give."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from gcar_deploy.cli.main import gcar
+from gcar_deploy.geometry.scene import Scene, View, scene_to_json
+from gcar_deploy.inspection import inspect_files, volume_coverage
+from gcar_deploy.selftest import tiny_case
+
+
+@pytest.fixture
+def case(tmp_path):
+    """The generated tiny case as files: pictures and scene."""
+    angiograms, grid, _ = tiny_case()
+    views = []
+    for k, a in enumerate(angiograms):
+        counts = np.rint(a.pixels).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"view{k + 1}.png"), counts)
+        views.append(View(id=str(k + 1), carm=a.carm, intensity=a.intensity))
+    (tmp_path / "geom.json").write_text(scene_to_json(Scene(views=tuple(views), grid=grid)))
+    return tmp_path
+
+
+def files(case):
+    return [case / "view1.png", case / "view2.png"], case / "geom.json"
+
+
+def test_a_good_case(case):
+    found = inspect_files(*files(case))
+    assert found.error is None
+    out = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert out["would"] == "reconstruct" and out["exit_code"] == 0
+    assert [v["name"] for v in out["views"]] == ["RAO 30 CAU 20", "LAO 45 CRA 25"]
+    assert all(0.5 < v["coverage"] <= 1 and v["vessel_share"] > 0 for v in out["views"])
+    assert 80 < out["pairs"][0]["separation_deg"] < 90
+    assert out["pairs"][0]["disagreement"] < 0.05
+    assert any("unseen in the pictures" in text for text in out["silent_errors"])
+
+
+def test_nothing_is_written(case):
+    before = sorted(p.name for p in case.iterdir())
+    inspect_files(*files(case))
+    assert sorted(p.name for p in case.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda c: (c / "view2.png").write_bytes(b"no picture"), 3),
+        (lambda c: (c / "view2.png").unlink(), 3),
+        (lambda c: cv2.imwrite(str(c / "view2.png"), np.zeros((96, 96), np.uint16)), 6),
+        (lambda c: (c / "geom.json").write_text("{}"), 4),
+        (lambda c: (c / "view2.png").write_bytes((c / "view1.png").read_bytes()), 6),
+    ],
+)
+def test_says_what_run_would_refuse_with_its_code(case, change, code):
+    change(case)
+    found = inspect_files(*files(case))
+    assert found.error is not None and found.error.exit_code == code
+    runner = CliRunner()
+    pictures, geom = files(case)
+    args = ["validate", *map(str, pictures), "--geom", str(geom)]
+    result = runner.invoke(gcar, [*args, "--json"])
+    assert '"would": "refuse"' in result.output
+
+
+def test_command_prints_clinical_words(case):
+    pictures, geom = files(case)
+    result = CliRunner().invoke(gcar, ["validate", *map(str, pictures), "--geom", str(geom)])
+    assert result.exit_code == 0
+    assert "RAO 30 CAU 20" in result.output and "deg apart" in result.output
+    assert "would be reconstructed" in result.output
+
+
+def test_coverage_of_the_volume():
+    angiograms, grid, _ = tiny_case()
+    carm = angiograms[0].carm
+    whole = volume_coverage(carm, dataclasses.replace(grid, size_mm=(5.0, 5.0, 5.0)))
+    none = volume_coverage(carm, dataclasses.replace(grid, center_mm=(300.0, 0.0, 0.0)))
+    assert whole == 1.0 and none < 0.05
