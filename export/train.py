@@ -35,8 +35,8 @@ class TrainOptions:
     """Optimiser settings; the schedule is warm-up, constant, then linear to zero."""
 
     seed: int = 1
-    steps: int = 16_000
-    decay_steps: int = 5_000
+    steps: int = 5_250
+    decay_steps: int = 3_250
     replicas: int = 2
     warmup_steps: int = 200
     learning_rate: float = 1.5e-3

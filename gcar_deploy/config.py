@@ -92,6 +92,8 @@ class PoseOptions:
     fine_mm: float = 0.5
     #: how well two profiles of the same tree agree, as a share of their norm
     profile_noise: float = 0.05
+    #: directions further apart than this are not compared: see ``estimate_poses``
+    most_apart_deg: float = 150.0
     #: a correction must lower the disagreement to this share of what it was
     min_gain: float = 0.85
     max_evaluations: int = 40
@@ -180,7 +182,9 @@ class TubeOptions:
     piece_mm: float = 100.0
     #: cost of a mm of piece per confidence below ``fair_confidence``, units of the objective
     piece_cost: float = 20.0
-    fair_confidence: float = 0.7
+    fair_confidence: float = 0.4
+    #: a piece is never dropped whose confidence is at least this share of the kept ones' median
+    trusted_share: float = 0.8
     #: a piece standing alone is at most so many times as thick as the starting points say
     piece_growth: float = 2.5
     #: a piece is kept from this share on; 0 keeps all
@@ -238,6 +242,9 @@ class PaperOptions:
     least_confidence: float = 0.3
     initial_sigma_cells: float = 0.55
     most_gaussians: int = 10_000
+    #: points nearer than this to a more confident one share its Gaussian, cells; 0 keeps all.
+    #: 1.1 halves Gaussians and time, and costs accuracy where the points are good
+    thin_cells: float = 0.0
     #: bounds of the standard deviations
     least_sigma_pixels: float = 0.25
     largest_sigma_mm: float = 10.0

@@ -11,19 +11,39 @@ from gcar_deploy.types import Array
 
 #: a split puts the halves this many standard deviations to each side along the longest axis
 SPLIT_SIGMAS = 0.8
+#: distance of a clone from its twin, in the smallest standard deviation: enough to part them,
+#: too little to show (the pair's second moment grows by 1 %)
+CLONE_SIGMAS = 0.2
 
 
-def clone(gaussians: Gaussians, chosen: Array) -> Gaussians:
-    """Replace each chosen Gaussian by two of half its intensity in the same place.
+def clone(gaussians: Gaussians, chosen: Array, pull: Array) -> Gaussians:
+    """Replace each chosen Gaussian by two of half its intensity, ``CLONE_SIGMAS`` apart.
+
+    Two equal Gaussians in one place have equal gradients and would stay one for ever, so the
+    pair is set apart along the pull.
+
+    Parameters
+    ----------
+    chosen : (m,) indices
+    pull : (m, 3) position gradients of the chosen; zero pulls along x
 
     Returns
     -------
-    Gaussians, the copies appended at the end; total mass unchanged
+    Gaussians, the copies appended at the end; mass and its centre unchanged
     """
     intensity = gaussians.intensity.copy()
     intensity[chosen] *= 0.5
-    halved = dataclasses.replace(gaussians, intensity=intensity)
-    return concatenate([halved, halved.select(chosen)])
+    length = np.linalg.norm(pull, axis=1, keepdims=True)
+    # A floor on the length alone would lose the direction of very small gradients.
+    direction = np.where(length > 0, pull / np.where(length > 0, length, 1.0), [1.0, 0.0, 0.0])
+    smallest = gaussians.scales_mm[chosen].min(axis=1, keepdims=True)
+    offset = 0.5 * CLONE_SIGMAS * smallest * direction
+    means = gaussians.means_mm.copy()
+    means[chosen] -= offset
+    halved = dataclasses.replace(gaussians, means_mm=means, intensity=intensity)
+    copies = halved.select(chosen)
+    copies = dataclasses.replace(copies, means_mm=copies.means_mm + 2 * offset)
+    return concatenate([halved, copies])
 
 
 def split(gaussians: Gaussians, chosen: Array) -> Gaussians:

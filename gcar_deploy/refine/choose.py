@@ -115,6 +115,11 @@ def weigh_pieces(
     gram, pull = _normal(alone, segment, count, targets)
     cost = options.piece_cost * total * (options.fair_confidence - confidence)
     share = _solve(gram, pull - cost, confidence)
+    kept = share >= options.min_share
+    if kept.any():
+        # The level of confidence depends on the predictor; ghosts stand out below its usual.
+        usual = _weighted_median(confidence[kept], total[kept])
+        share = np.where(confidence >= options.trusted_share * usual, 1.0, share)
     return Pieces(segment, total, confidence, share)
 
 
@@ -186,6 +191,12 @@ def _solve(gram: Array, pull: Scalars, start: Scalars) -> Scalars:
     )  # fmt: skip
     out: Scalars = np.clip(found.x, 0.0, 1.0)
     return out
+
+
+def _weighted_median(values: Scalars, weight: Scalars) -> float:
+    order = np.argsort(values, kind="stable")
+    part = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(part, 0.5 * part[-1])])
 
 
 def _kept(tree: Tree, tubes: Tubes, pieces: Pieces, options: TubeOptions) -> Tree:

@@ -12,7 +12,7 @@ from gcar_deploy.types import Array, Image, Mask
 
 
 def projection_loss(
-    made: Array, picture: Image, skeleton: Mask, alpha: float
+    made: Array, picture: Image, skeleton: Mask, valid: Mask, alpha: float
 ) -> tuple[float, Array]:
     """Loss of one view and its gradient by the picture made.
 
@@ -20,6 +20,7 @@ def projection_loss(
     ----------
     made, picture : (rows, cols) path length, mm
     skeleton : (rows, cols) M_cl
+    valid : (rows, cols) pixels that carry a picture; the others pull at nothing
     alpha : 1 for plain L2
 
     Returns
@@ -28,8 +29,9 @@ def projection_loss(
     gradient : (rows, cols) mm
     """
     r = np.asarray(made, dtype=np.float64) - picture
-    weight = np.full(r.shape, alpha / r.size)
-    count = int(skeleton.sum())
-    if count:
-        weight[skeleton] += (1.0 - alpha) / count
+    weight = np.zeros(r.shape)
+    for share, pixels in ((alpha, valid), (1.0 - alpha, skeleton & valid)):
+        count = np.count_nonzero(pixels)
+        if count:
+            weight[pixels] += share / count
     return float(np.sum(weight * r * r)), 2.0 * weight * r

@@ -11,18 +11,19 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
 from gcar_deploy.config import PaperOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.density_control import clone, most_wanting, prune, split
-from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.gaussians.gaussians import TWO_PI_3_2, Gaussians
 from gcar_deploy.gaussians.project import Gradient, project, project_vjp
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import sampled
 from gcar_deploy.refine.adam import Adam
 from gcar_deploy.refine.loss import projection_loss
-from gcar_deploy.types import Array
+from gcar_deploy.types import Array, Points
 
 Progress = Callable[[float], None]
 MOST_REJECTED = 5
@@ -50,23 +51,49 @@ class PaperResult:
 
 
 def initial_gaussians(centers: CenterPoints, options: PaperOptions) -> Gaussians:
-    """One isotropic Gaussian per point, as many as the cap allows, the most confident first.
+    """Place as few isotropic Gaussians as the points need, and never more than the cap.
 
-    The mass of a point's cell, confidence times spacing^3, is kept: sigma is
-    ``initial_sigma_cells`` of a cell and the intensity follows.
+    Points closer than ``thin_cells`` to a more confident one join the nearest that stays. Each
+    Gaussian takes the mass (confidence times spacing^3 of each), the centre and the spread of
+    its points, to which a single point's own ``initial_sigma_cells`` is added.
     """
-    kept = np.flatnonzero(centers.confidence >= options.least_confidence)
-    order = np.argsort(-centers.confidence[kept], kind="stable")[: options.most_gaussians]
-    kept = np.sort(kept[order])
-    n, h = len(kept), centers.spacing_mm
-    sigma = options.initial_sigma_cells * h
-    mass = centers.confidence[kept] * h**3
+    used = centers.select(centers.confidence >= options.least_confidence)
+    h = used.spacing_mm
+    order = np.argsort(-used.confidence, kind="stable")
+    if options.thin_cells > 0:
+        used = used.select(order)
+        head = _heads(used.points_mm, options.thin_cells * h)[: options.most_gaussians]
+        nearest = cKDTree(used.points_mm[head]).query(used.points_mm)[1] if len(head) else head
+    else:
+        used = used.select(np.sort(order[: options.most_gaussians]))
+        head = nearest = np.arange(len(used))
+    n = len(head)
+    share = np.maximum(used.confidence, 1e-6)
+    weight = np.bincount(nearest, share, minlength=n)
+    sums = [np.bincount(nearest, share * x, minlength=n) for x in used.points_mm.T]
+    mean: Array = np.stack(sums, axis=1) / weight[:, None]
+    apart = np.sum((used.points_mm - mean[nearest]) ** 2, axis=1) / 3.0
+    spread = np.bincount(nearest, share * apart, minlength=n) / weight
+    sigma = np.sqrt(spread + (options.initial_sigma_cells * h) ** 2)
     return Gaussians(
-        means_mm=centers.points_mm[kept],
-        scales_mm=np.full((n, 3), sigma),
+        means_mm=mean,
+        scales_mm=np.repeat(sigma[:, None], 3, axis=1),
         quaternions_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-        intensity=mass / ((2 * np.pi) ** 1.5 * sigma**3),
+        intensity=weight * h**3 / (TWO_PI_3_2 * sigma**3),
     )
+
+
+def _heads(points: Points, distance_mm: float) -> Array:
+    """Pick points in order, none within ``distance_mm`` of one picked before."""
+    if distance_mm <= 0 or not len(points):
+        return np.arange(len(points))
+    free = np.ones(len(points), bool)
+    head = []
+    for i, near in enumerate(cKDTree(points).query_ball_point(points, distance_mm)):
+        if free[i]:
+            head.append(i)
+            free[near] = False
+    return np.asarray(head, dtype=np.int64)
 
 
 def refine_paper(
@@ -205,7 +232,9 @@ def _loss(
     total, parts = 0.0, []
     for view in views:
         made = project(g, view.carm)
-        loss, by_picture = projection_loss(made, view.path_mm, view.skeleton, options.alpha)
+        loss, by_picture = projection_loss(
+            made, view.path_mm, view.skeleton, view.valid, options.alpha
+        )
         total += loss
         parts.append(project_vjp(g, view.carm, by_picture))
     names = [f.name for f in dataclasses.fields(Gradient)]
@@ -235,7 +264,8 @@ def _controlled(
     wanting = most_wanting(pull, threshold, options.most_gaussians - len(g))
     large = g.scales_mm[wanting].max(axis=1, initial=0.0) > options.split_pixels * pixel_mm
     splitting, cloning = wanting[large], wanting[~large]
-    g = clone(split(g, splitting), cloning)
+    # Splitting appends, so the indices of the others stay.
+    g = clone(split(g, splitting), cloning, gradient.means_mm[cloning])
     mass = g.masses_mm3()
     least = options.least_mass_share * float(np.median(mass)) if len(mass) else 0.0
     g, reasons = prune(g, least)

@@ -24,7 +24,7 @@ from gcar_deploy.refine.tube import (
 from gcar_deploy.refine.tube_model import Tubes, tubes_of
 from gcar_deploy.refine.tube_prior import Prior, make_prior
 from gcar_deploy.refine.uncertainty import fit_sigma, geometry_sigma
-from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Scalars
 
@@ -66,7 +66,9 @@ def fit_tubes(
     should_stop : callable, asked before each step; True ends the fit with the best so far
     """
     progress = Progress()
-    settled_centers, scatter = settled(centers, [(view.carm, view.path_mm) for view in views])
+    settled_centers, scatter = settled(
+        usable_points(centers), [(view.carm, view.path_mm) for view in views]
+    )
     tree = build_tree(settled_centers, tree_options)
     contrast = (1.0,) * len(views)
     if tree.branches:

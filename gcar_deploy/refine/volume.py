@@ -27,6 +27,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.refine.settle import scatter_is_none
 from gcar_deploy.refine.splat import cell_view, shrunk
 from gcar_deploy.refine.tube_model import footprint, tubes_of
+from gcar_deploy.tree.centerline import usable_points
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Points, Scalars, Volume
@@ -101,6 +102,7 @@ def tube_volume(
     operators, errors, variances = _pictures(
         band, tree, grid, views, contrast, edge_blur_mm, options
     )
+    centers = None if centers is None else usable_points(centers)
     if centers is not None and len(centers):
         told = _points(band, tree, grid, centers, options)
         if told is not None:

@@ -27,6 +27,12 @@ from gcar_deploy.types import Array, Points, Scalars
 MIDDLE_PREFERENCE = 6.0
 #: cost of a bridged cell beside a cell of confident vessel.
 BRIDGE_COST = 4.0
+#: points further than this from the middle one (along an axis) are no coronary vessel, mm.
+MAX_REACH_MM = 200.0
+#: cells of the local raster at most.
+MAX_CELLS = 40_000_000
+#: a larger given radius is no coronary vessel's, mm.
+MAX_GIVEN_RADIUS_MM = 6.0
 #: empty cells round the raster.
 PAD = 4
 
@@ -67,8 +73,7 @@ def build_tree(centers: CenterPoints, options: TreeOptions | None = None) -> Tre
     Tree, possibly with several components, possibly empty; sigma is NaN.
     """
     options = options or TreeOptions()
-    usable = np.isfinite(centers.points_mm).all(axis=1) & (centers.confidence > 0)
-    centers = centers.select(usable)
+    centers = usable_points(centers)
     if not len(centers):
         return empty_tree()
     graph = cell_graph(centers, options)
@@ -76,6 +81,27 @@ def build_tree(centers: CenterPoints, options: TreeOptions | None = None) -> Tre
         return empty_tree()
     paths = _paths(graph, options)
     return draw_branches(graph.points_mm, paths, centers, options)
+
+
+def usable_points(centers: CenterPoints) -> CenterPoints:
+    """Leave out points that are not finite, carry no confidence or lie absurdly far away.
+
+    Confidence is held to 0 .. 1 and a given radius to below ``MAX_GIVEN_RADIUS_MM``.
+    """
+    weight = np.nan_to_num(centers.confidence, nan=0.0, posinf=1.0, neginf=0.0)
+    keep = np.isfinite(centers.points_mm).all(axis=1) & (weight > 0)
+    if keep.any():
+        middle = np.median(centers.points_mm[keep], axis=0)
+        reach = min(MAX_REACH_MM, 0.5 * centers.spacing_mm * MAX_CELLS ** (1 / 3))
+        points = np.where(keep[:, None], centers.points_mm, middle)
+        keep &= np.abs(points - middle).max(axis=1) < reach
+    radius = np.where(
+        (centers.radius_mm > 0) & (centers.radius_mm < MAX_GIVEN_RADIUS_MM),
+        centers.radius_mm,
+        np.nan,
+    )
+    clean = dataclasses.replace(centers, confidence=np.clip(weight, 0.0, 1.0), radius_mm=radius)
+    return clean.select(keep)
 
 
 def cell_graph(centers: CenterPoints, options: TreeOptions) -> CellGraph:

@@ -50,9 +50,11 @@ def test_outside_and_none():
 def test_clone_and_split_keep_mass_and_centre():
     g = random_gaussians(10, 3)
     chosen = np.array([1, 4, 9])
-    for change in (clone, split):
-        out = change(g, chosen)
+    pull = np.array([[1e-9, 2e-9, 0], [0, 0, 0], [3.0, -1, 5]])
+    for out in (clone(g, chosen, pull), split(g, chosen)):
         assert len(out) == 13
+        # Twins in one place would have equal gradients and never part.
+        assert np.linalg.norm(out.means_mm[chosen] - out.means_mm[10:], axis=1).min() > 0.1
         m0, m1 = g.masses_mm3(), out.masses_mm3()
         assert m1.sum() == pytest.approx(m0.sum(), rel=1e-12)
         np.testing.assert_allclose(m1 @ out.means_mm, m0 @ g.means_mm, atol=1e-8)

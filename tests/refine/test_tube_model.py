@@ -52,7 +52,7 @@ def test_joined_tubes_are_a_union_not_a_sum():
 
 def test_tubes_at_different_depth_add_up():
     line = np.stack([np.linspace(-15, 15, 31), np.zeros(31), np.zeros(31)], 1)
-    other = line + [0, 20.0, 0]
+    other = line + np.array([0, 20.0, 0])
     both = Tree(
         nodes_mm=np.concatenate([line[[0, -1]], other[[0, -1]]]),
         branches=(branch(line, 1.5), branch(other, 1.5, 2, 3)),
