@@ -286,7 +286,7 @@ class QualityOptions:
     #: simulated raw pairs of one tree lie at 0.06 .. 0.48 and overlap with those of two trees
     #: (0.14 .. 0.58), so between these figures the finished tree decides: it leaves more than a
     #: tenth of the vessels of a view unexplained in all nine pairs of two trees, in one of one
-    good_disagreement_raw: float = 0.11
+    good_disagreement_raw: float = 0.13
     max_disagreement_raw: float = 0.6
     #: share of a view's skeleton that the reprojected tree explains
     good_coverage: float = 0.9
