@@ -355,11 +355,22 @@ class CArm:
         )
 
     def turned(self, primary_deg: float = 0.0, secondary_deg: float = 0.0) -> CArm:
-        """Return the same view with angles changed by so many degrees (matrix dropped)."""
+        """Return the same view with angles changed by so many degrees (matrix dropped).
+
+        Beyond the poles and the back the same direction is named within the allowed ranges:
+        (a, b, g) = (a + 180, 180 - b, g + 180).
+        """
+        primary = self.primary_angle_deg + primary_deg
+        secondary = self.secondary_angle_deg + secondary_deg
+        rotation = self.detector_rotation_deg
+        if abs(secondary) > 90.0:
+            primary, secondary = primary + 180.0, math.copysign(180.0, secondary) - secondary
+            rotation += 180.0 if rotation <= 0 else -180.0
         return dataclasses.replace(
             self,
-            primary_angle_deg=self.primary_angle_deg + primary_deg,
-            secondary_angle_deg=self.secondary_angle_deg + secondary_deg,
+            primary_angle_deg=primary if abs(primary) <= 180.0 else (primary + 180) % 360 - 180,
+            secondary_angle_deg=secondary,
+            detector_rotation_deg=rotation,
             projection_matrix=None,
         )
 

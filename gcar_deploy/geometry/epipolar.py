@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.types import Array, Pixels, Points, Scalars
 
@@ -66,11 +67,23 @@ def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scala
 
     Planes of the pair (first, second) turn about the line through both sources; zero is the
     plane through the isocentre. ``carm`` is one of the pair.
+
+    Raises
+    ------
+    GeometryError
+        Both sources coincide, or the isocentre lies between them on one line: no plane is
+        defined.
     """
     base = second.source_mm - first.source_mm
-    base = base / np.linalg.norm(base)
+    length = float(np.linalg.norm(base))
+    if length < 1e-6:
+        raise GeometryError("both views have the same source: they have no epipolar planes")
+    base = base / length
     towards = -first.source_mm - (-first.source_mm @ base) * base
-    e1 = towards / np.linalg.norm(towards)
+    distance = float(np.linalg.norm(towards))
+    if distance < 1e-6:
+        raise GeometryError("the views face each other exactly: no plane through the isocentre")
+    e1 = towards / distance
     e2 = np.cross(base, e1)
     rays = carm.rays(pixels)
     return np.arctan2(rays @ e2, rays @ e1)

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import expm
 
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.types import Array, Points, Scalars
@@ -23,6 +25,8 @@ RELATIVE_CUTOFF = 1e-6
 ALONG_BEAM_DEG = 5.0
 #: bounds between the classes, in units of the noise at the isocentre
 WEAK, NONE = 3.0, 10.0
+#: an error counts as silent if the pictures show less than this share of its effect
+SILENT_SHARE = 0.05
 
 
 class Observability(enum.IntEnum):
@@ -154,37 +158,77 @@ def rmse_two_views(theta_deg: float, noise_mm: float = 1.0) -> float:
 
 
 def silent_errors(carms: Sequence[CArm]) -> tuple[str, ...]:
-    """Say what no pair of pictures can show, with what it does to points 50 mm from the centre.
+    """Say which usual errors of the geometry these views cannot show, and what each does.
+
+    Each error is applied to the views in turn; it is silent if the pictures betray less than a
+    twentieth of what it does to the points. Points fill a cube of +-50 mm evenly (its eight Gauss
+    points have the same second moments), errors are root mean square.
 
     Returns
     -------
     sentences, each with the error in the geometry, its effect in mm, and that it leaves no trace
     """
-    corners = 50.0 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    angle = max(
-        (
-            min(s, 180 - s)
-            for i, a in enumerate(carms)
-            for b in carms[:i]
-            for s in (separation_deg(a, b),)
-        ),
-        default=0.0,
-    )
+    points = 50.0 / math.sqrt(3.0) * np.array(list(itertools.product((-1, 1), repeat=3)))
+    apart = [separation_deg(a, b) for a, b in itertools.combinations(carms, 2)]
+    angle = max((min(s, 180 - s) for s in apart), default=0.0)
     out = []
-    changes = [
-        ("1 deg in the primary angle of the last view", [*carms[:-1], carms[-1].turned(1.0)]),
+    for name, true in _usual_errors(carms):
+        shift = _triangulation_shift(carms, true, points)
+        effect = math.sqrt(float(np.mean(np.sum(shift**2, axis=1))))
+        if effect > 0.05 and _trace_mm(carms, true, points, shift) < SILENT_SHARE * effect:
+            out.append(
+                f"{name} moves points by {effect:.1f} mm at {angle:.0f} deg, unseen in the pictures"
+            )
+    return tuple(out)
+
+
+def _usual_errors(carms: Sequence[CArm]) -> list[tuple[str, list[CArm]]]:
+    """Name what is often wrong, with the views as they would then really be."""
+    rest, last = list(carms[:-1]), carms[-1]
+    pitch = 1.03 if max(max(c.pixel_spacing_mm) for c in carms) < 9 else 0.97
+    return [
+        ("1 deg in the angle between the first and the last view", [*rest, _swung(carms, 1.0)]),
         (
             "a patient 5 mm off between the runs, within the plane of the beams",
-            [*carms[:-1], carms[-1].moved(_in_plane(carms) * 5.0)],
+            [*rest, last.moved(_in_plane(carms) * 5.0)],
+        ),
+        # A source 30 mm further away is a patient 30 mm nearer to the detector.
+        ("30 mm in the source distance of all views", [c.moved(30.0 * c.axes[2]) for c in carms]),
+        (
+            "3 % in the pixel spacing of all views",
+            [
+                dataclasses.replace(
+                    c,
+                    pixel_spacing_mm=(pitch * c.pixel_spacing_mm[0], pitch * c.pixel_spacing_mm[1]),
+                    projection_matrix=None,
+                )
+                for c in carms
+            ],
         ),
     ]
-    for name, true in changes:
-        shift = _triangulation_shift(carms, true, corners)
-        effect = math.sqrt(float(np.mean(np.sum(shift**2, axis=1))))
-        out.append(
-            f"{name} moves points by {effect:.1f} mm at {angle:.0f} deg, unseen in the pictures"
-        )
-    return tuple(out)
+
+
+def _trace_mm(
+    told: Sequence[CArm], true: Sequence[CArm], points_mm: Points, shift_mm: Points
+) -> float:
+    """Residual that the triangulated points leave per coordinate, mm at the isocentre, rms."""
+    squares = []
+    for a, b in zip(told, true, strict=True):
+        change = b.project(points_mm)[0] - a.project(points_mm)[0]
+        left = change - np.einsum("nij,nj->ni", a.jacobian(points_mm), shift_mm)
+        squares.append(np.mean((left * a.pixel_at_isocenter_mm) ** 2))
+    return math.sqrt(float(np.mean(squares)))
+
+
+def _swung(carms: Sequence[CArm], angle_deg: float) -> CArm:
+    """Return the last view turned about the isocentre within the plane of the first and last."""
+    normal = np.cross(_in_plane(carms), carms[-1].axes[2])
+    x, y, z = math.radians(angle_deg) * normal
+    P = carms[-1].world2pixel
+    turn = expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+    return CArm.from_matrix(
+        np.column_stack([P[:, :3] @ turn, P[:, 3]]), rows=carms[-1].rows, columns=carms[-1].columns
+    )
 
 
 def _in_plane(carms: Sequence[CArm]) -> Array:

@@ -7,7 +7,6 @@ for numbers. Every refusal is one line that names the file, the view, the key an
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import math
 from pathlib import Path
@@ -15,10 +14,19 @@ from typing import Any
 
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CLINICAL_RANGES, CArm
+from gcar_deploy.geometry.fields import (
+    MAX_BYTES,
+    check_choice,
+    check_object,
+    number,
+    numbers,
+    quote,
+    read_json,
+    whole,
+)
 from gcar_deploy.geometry.grid import Grid
 
 SCHEMA = "gcar-geometry/1"
-MAX_BYTES = 64 * 1024
 MIN_VIEWS, MAX_VIEWS = 2, 16
 KINDS = ("path_length", "attenuation", "raw")
 POLARITIES = ("auto", "dark", "bright")
@@ -26,6 +34,8 @@ POLARITIES = ("auto", "dark", "bright")
 DEFAULT_SHAPE = 128
 #: the default volume never grows beyond this edge: the heart with its vessels fits, mm
 DEFAULT_EDGE_MM = 180.0
+#: bounds that keep the arithmetic finite: table positions, principal points, matrix entries
+MAX_OFFSET_MM, MAX_POINT_PX, MAX_ENTRY = 500.0, 1e5, 1e9
 
 _VIEW_NUMBERS = ("primary_angle_deg", "secondary_angle_deg", "sod_mm", "sdd_mm")
 _REQUIRED = (*_VIEW_NUMBERS, "rows", "columns", "pixel_spacing_mm")
@@ -37,6 +47,7 @@ _OPTIONAL = (
     "projection_matrix",
     "intensity",
 )
+_ROTATION = "detector_rotation_deg"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,8 +67,8 @@ class Intensity:
     mm_per_count: float | None = None
 
     def __post_init__(self) -> None:
-        _one_of("intensity.kind", self.kind, KINDS)
-        _one_of("intensity.polarity", self.polarity, POLARITIES)
+        check_choice("intensity.kind", self.kind, KINDS)
+        check_choice("intensity.polarity", self.polarity, POLARITIES)
         scale = self.mm_per_count
         if scale is not None and not (math.isfinite(scale) and 1e-9 <= scale <= 1e3):
             raise GeometryError(f"intensity.mm_per_count = {scale!r} is outside 1e-9 .. 1000 mm")
@@ -135,7 +146,7 @@ def load_scene(path: str | Path) -> Scene:
 def parse_scene(text: str, name: str = "geom.json") -> Scene:
     """Check the text of a scene file; ``name`` is what errors call it."""
     try:
-        return _scene(_strict_json(text))
+        return _scene(read_json(text))
     except GeometryError as error:
         raise GeometryError(f"{name}: {error}") from None
 
@@ -195,39 +206,15 @@ def match_picture(carm: CArm, rows: int, columns: int) -> tuple[CArm, str | None
     )
 
 
-# -- strict JSON ----------------------------------------------------------------------------
-
-
-def _strict_json(text: str) -> Any:
-    def refuse(token: str) -> Any:
-        raise GeometryError(f"{token} is not a number in JSON")
-
-    def pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
-        out: dict[str, Any] = {}
-        for key, value in items:
-            if key in out:
-                raise GeometryError(f"key {key!r} stands twice")
-            out[key] = value
-        return out
-
-    if len(text.encode("utf-8", "replace")) > MAX_BYTES:
-        raise GeometryError(f"larger than {MAX_BYTES // 1024} KiB")
-    try:
-        return json.loads(text, parse_constant=refuse, object_pairs_hook=pairs)
-    except json.JSONDecodeError as error:
-        raise GeometryError(f"not JSON: {error.msg} at line {error.lineno}") from None
-    except RecursionError:
-        raise GeometryError("not a scene: nested too deeply") from None
-    except ValueError:
-        raise GeometryError("a number has too many digits") from None
+# -- parsing --------------------------------------------------------------------------------
 
 
 def _scene(data: Any) -> Scene:
-    _object("the file", data, ("schema", "frame", "views", "volume"))
+    check_object("the file", data, ("schema", "frame", "views", "volume"))
     if data.get("schema") != SCHEMA:
-        raise GeometryError(f"schema = {data.get('schema')!r} must be {SCHEMA!r}")
+        raise GeometryError(f"schema = {quote(data.get('schema'))} must be {SCHEMA!r}")
     if data.get("frame", "LPS") != "LPS":
-        raise GeometryError(f"frame = {data['frame']!r} must be 'LPS'")
+        raise GeometryError(f"frame = {quote(data['frame'])} must be 'LPS'")
     views = data.get("views")
     if not isinstance(views, list):
         raise GeometryError("views is missing or not a list")
@@ -245,76 +232,103 @@ def _scene(data: Any) -> Scene:
             raise GeometryError(f"view {k + 1}: id {parsed[-1].id!r} stands twice")
     volume = data.get("volume")
     grid = None if volume is None else _grid(volume)
-    scene = Scene(views=tuple(parsed), grid=grid, warnings=tuple(_warnings(parsed)))
+    scene = Scene(views=tuple(parsed), grid=grid, warnings=tuple(_warnings(parsed, views)))
     _check_placing(scene)
     return scene
 
 
 def _view(entry: Any, k: int) -> View:
-    _object("the view", entry, (*_REQUIRED, *_OPTIONAL))
+    check_object("the view", entry, (*_REQUIRED, *_OPTIONAL))
     name = entry.get("id", str(k + 1))
     if not isinstance(name, str) or not 1 <= len(name) <= 64 or not name.isprintable():
-        raise GeometryError(f"id = {name!r} must be text of 1 .. 64 characters")
-    intensity = _intensity(entry.get("intensity"))
-    matrix = entry.get("projection_matrix")
-    if matrix is not None:
-        _number_rows(matrix)
-    alone = matrix is not None and not any(key in entry for key in _VIEW_NUMBERS)
-    needed = ("rows", "columns") if alone else _REQUIRED
-    for key in needed:
+        raise GeometryError(f"id = {quote(name)} must be text of 1 .. 64 characters")
+    alone = _matrix_alone(entry)
+    for key in ("rows", "columns") if alone else _REQUIRED:
         if entry.get(key) is None:
             raise GeometryError(f"{key} is missing")
-    rows, columns = _whole("rows", entry["rows"]), _whole("columns", entry["columns"])
-    if alone:
-        carm = CArm.from_matrix(matrix, rows=rows, columns=columns)
-        return View(id=name, carm=carm, intensity=intensity)
-    spacing = _numbers("pixel_spacing_mm", entry["pixel_spacing_mm"], 2)
-    point = entry.get("principal_point_px")
-    offset = entry.get("isocenter_offset_mm")
-    moved = (0.0, 0.0, 0.0) if offset is None else _numbers("isocenter_offset_mm", offset, 3)
-    if any(abs(x) > 500 for x in moved):
-        raise GeometryError(f"isocenter_offset_mm = {list(moved)} is outside -500 .. 500 mm")
-    rotation = entry.get("detector_rotation_deg")
-    carm = CArm(
-        **{key: _number(key, entry[key]) for key in _VIEW_NUMBERS},
-        rows=rows,
-        columns=columns,
-        pixel_spacing_mm=(spacing[0], spacing[1]),
-        detector_rotation_deg=0.0
-        if rotation is None
-        else _number("detector_rotation_deg", rotation),
-        principal_point_px=None
-        if point is None
-        else _pair(_numbers("principal_point_px", point, 2)),
-        isocenter_offset_mm=(moved[0], moved[1], moved[2]),
-        projection_matrix=None if matrix is None else tuple(tuple(map(float, r)) for r in matrix),
+    carm = _carm_of_matrix(entry) if alone else _carm_of_angles(entry)
+    return View(id=name, carm=carm, intensity=_intensity(entry.get("intensity")))
+
+
+def _matrix_alone(entry: dict[str, Any]) -> bool:
+    """Tell whether a matrix replaces the angles and distances, rather than stand beside them."""
+    return entry.get("projection_matrix") is not None and not any(
+        key in entry for key in _VIEW_NUMBERS
     )
-    return View(id=name, carm=carm, intensity=intensity)
+
+
+def _carm_of_angles(entry: dict[str, Any]) -> CArm:
+    spacing = numbers("pixel_spacing_mm", entry["pixel_spacing_mm"], 2)
+    point = entry.get("principal_point_px")
+    if point is not None:
+        point = tuple(numbers("principal_point_px", point, 2, MAX_POINT_PX))
+    offset = entry.get("isocenter_offset_mm")
+    if offset is None:
+        offset = [0.0, 0.0, 0.0]
+    moved = numbers("isocenter_offset_mm", offset, 3, MAX_OFFSET_MM)
+    rotation = entry.get("detector_rotation_deg")
+    return CArm(
+        **{key: number(key, entry[key]) for key in _VIEW_NUMBERS},
+        rows=whole("rows", entry["rows"]),
+        columns=whole("columns", entry["columns"]),
+        pixel_spacing_mm=(spacing[0], spacing[1]),
+        detector_rotation_deg=0.0 if rotation is None else number(_ROTATION, rotation),
+        principal_point_px=point,
+        isocenter_offset_mm=(moved[0], moved[1], moved[2]),
+        projection_matrix=_matrix(entry.get("projection_matrix")),
+    )
+
+
+def _carm_of_matrix(entry: dict[str, Any]) -> CArm:
+    """Build the view from its matrix; the pixel spacing, if given, tells the detector's distance.
+
+    A matrix holds rotation, principal point and table position already: a second word on them
+    would have to be ignored, so it is refused.
+    """
+    for key in (_ROTATION, "principal_point_px", "isocenter_offset_mm"):
+        value = entry.get(key)
+        if value not in (None, 0, [0, 0, 0]) or isinstance(value, bool):
+            raise GeometryError(f"{key} = {quote(value)} is at odds with a lone projection_matrix")
+    rows, columns = whole("rows", entry["rows"]), whole("columns", entry["columns"])
+    matrix = _matrix(entry["projection_matrix"])
+    carm = CArm.from_matrix(matrix, rows=rows, columns=columns)
+    if entry.get("pixel_spacing_mm") is None:
+        return carm
+    row, column = numbers("pixel_spacing_mm", entry["pixel_spacing_mm"], 2)
+    return dataclasses.replace(carm, pixel_spacing_mm=(row, column), sdd_mm=carm.focal_px[1] * row)
+
+
+def _matrix(matrix: Any) -> tuple[tuple[float, ...], ...] | None:
+    if matrix is None:
+        return None
+    if not isinstance(matrix, list) or len(matrix) != 3:
+        raise GeometryError("projection_matrix must be 3 rows of 4 numbers")
+    return tuple(tuple(numbers("projection_matrix row", row, 4, MAX_ENTRY)) for row in matrix)
 
 
 def _intensity(entry: Any) -> Intensity:
     if entry is None:
         return Intensity(kind="raw")
-    _object("intensity", entry, ("kind", "polarity", "mm_per_count"))
+    check_object("intensity", entry, ("kind", "polarity", "mm_per_count"))
     scale = entry.get("mm_per_count")
     return Intensity(
         kind=entry.get("kind", "raw"),
         polarity=entry.get("polarity", "auto"),
-        mm_per_count=None if scale is None else _number("intensity.mm_per_count", scale),
+        mm_per_count=None if scale is None else number("intensity.mm_per_count", scale),
     )
 
 
 def _grid(entry: Any) -> Grid:
-    _object("volume", entry, ("center_mm", "size_mm", "shape"))
+    check_object("volume", entry, ("center_mm", "size_mm", "shape"))
     for key in ("size_mm", "shape"):
         if entry.get(key) is None:
             raise GeometryError(f"volume.{key} is missing")
-    center = _numbers("volume.center_mm", entry.get("center_mm", [0, 0, 0]), 3)
-    size = _numbers("volume.size_mm", entry["size_mm"], 3)
+    center = numbers("volume.center_mm", entry.get("center_mm", [0, 0, 0]), 3)
+    size = numbers("volume.size_mm", entry["size_mm"], 3)
     shape = entry["shape"]
     if not isinstance(shape, list) or len(shape) != 3:
-        raise GeometryError(f"volume.shape = {shape!r} must be 3 whole numbers")
-    nx, ny, nz = (_whole("volume.shape", n) for n in shape)
+        raise GeometryError(f"volume.shape = {quote(shape)} must be 3 whole numbers")
+    nx, ny, nz = (whole("volume.shape", n) for n in shape)
     return Grid(
         center_mm=(center[0], center[1], center[2]),
         size_mm=(size[0], size[1], size[2]),
@@ -340,10 +354,17 @@ def _check_placing(scene: Scene) -> None:
             )
 
 
-def _warnings(views: list[View]) -> list[str]:
+def _warnings(views: list[View], entries: list[dict[str, Any]]) -> list[str]:
     out = []
-    for view in views:
-        for key, (low, high, unit) in CLINICAL_RANGES.items():
+    for view, entry in zip(views, entries, strict=True):
+        ranges = dict(CLINICAL_RANGES)
+        if _matrix_alone(entry) and entry.get("pixel_spacing_mm") is None:
+            del ranges["sdd_mm"]
+            out.append(
+                f"view {view.id}: a projection_matrix without pixel_spacing_mm does not tell how "
+                f"far the detector is; a magnification of {view.carm.magnification:g} is assumed"
+            )
+        for key, (low, high, unit) in ranges.items():
             value = getattr(view.carm, key)
             if not low <= value <= high:
                 out.append(
@@ -351,57 +372,3 @@ def _warnings(views: list[View]) -> list[str]:
                     f"{low:g} .. {high:g} {unit}"
                 )
     return out
-
-
-# -- small checks ---------------------------------------------------------------------------
-
-
-def _object(what: str, value: Any, known: tuple[str, ...]) -> None:
-    if not isinstance(value, dict):
-        raise GeometryError(f"{what} must be a JSON object")
-    for key in value:
-        if key not in known:
-            close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(known)}"
-            raise GeometryError(f"unknown key {key[:60]!r}{hint}")
-
-
-def _number(key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise GeometryError(f"{key} = {value!r} must be a number"[:200])
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise GeometryError(f"{key} is not a finite number")
-    return number
-
-
-def _whole(key: str, value: Any) -> int:
-    number = _number(key, value)
-    if number != int(number):
-        raise GeometryError(f"{key} = {value!r} must be a whole number")
-    return int(number)
-
-
-def _numbers(key: str, value: Any, count: int) -> list[float]:
-    if not isinstance(value, list) or len(value) != count:
-        raise GeometryError(f"{key} = {value!r} must be {count} numbers"[:200])
-    return [_number(key, x) for x in value]
-
-
-def _number_rows(matrix: Any) -> None:
-    if not isinstance(matrix, list) or len(matrix) != 3:
-        raise GeometryError("projection_matrix must be 3 rows of 4 numbers")
-    for row in matrix:
-        _numbers("projection_matrix row", row, 4)
-
-
-def _pair(values: list[float]) -> tuple[float, float]:
-    return values[0], values[1]
-
-
-def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise GeometryError(f"{key} = {value!r} must be one of {', '.join(allowed)}")

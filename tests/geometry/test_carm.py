@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CArm, separation_deg
@@ -206,3 +207,46 @@ def test_separation_and_names():
     assert separation_deg(a, b) == pytest.approx(np.degrees(np.arccos(cosine)))
     assert a.clinical_name() == "RAO 30 CAU 20" and b.clinical_name() == "LAO 45 CRA 25"
     assert CArm(primary_angle_deg=0, secondary_angle_deg=0, **BASE).clinical_name() == "AP"
+
+
+@settings(max_examples=40, deadline=None)
+@given(arms, points, st.floats(-40, 40))
+def test_turning_patient_and_gantry_together_changes_nothing(carm, X, turn):
+    """About the long axis the primary angle takes up the patient's turn; no table offset here."""
+    carm = dataclasses.replace(carm, isocenter_offset_mm=(0.0, 0.0, 0.0))
+    c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
+    Rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    np.testing.assert_allclose(
+        carm.turned(turn).project(X @ Rz.T)[0], carm.project(X)[0], atol=1e-8
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(arms, points, st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-30, 30)] * 3))
+def test_rigid_motion_of_world_and_view_together(carm, X, axis, shift):
+    """P' = P [R s]^-1 sees the moved points where P sees the points."""
+    M = np.eye(4)
+    M[:3, :3], M[:3, 3] = Rotation.from_rotvec(axis).as_matrix(), shift
+    moved = CArm.from_matrix(
+        carm.world2pixel @ np.linalg.inv(M), rows=carm.rows, columns=carm.columns
+    )
+    Y = X @ M[:3, :3].T + M[:3, 3]
+    np.testing.assert_allclose(moved.project(Y)[0], carm.project(X)[0], atol=1e-6)
+    np.testing.assert_allclose(moved.project(Y)[1], carm.project(X)[1], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("start", "step"),
+    [((179, 10), (5, 0)), ((-178, 10), (-5, 0)), ((30, 88), (0, 5)), ((30, -88), (2, -5))],
+)
+def test_turning_over_the_ends_of_the_ranges(start, step):
+    """Angles beyond the ranges name the same direction within them."""
+    a, b = start[0] + step[0], start[1] + step[1]
+    carm = CArm(primary_angle_deg=start[0], secondary_angle_deg=start[1], **BASE).turned(*step)
+    a, b = np.deg2rad([a, b])
+    R = [
+        [np.cos(a), np.sin(a), 0],
+        [np.sin(a) * np.sin(b), -np.cos(a) * np.sin(b), -np.cos(b)],
+        [np.sin(a) * np.cos(b), -np.cos(a) * np.cos(b), np.sin(b)],
+    ]
+    np.testing.assert_allclose(carm.axes, R, atol=1e-12)

@@ -1,15 +1,10 @@
-"""Closed forms of the two-view bound, and the published sensitivities."""
+"""Closed forms of the two-view bound."""
 
 import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.epipolar import (
-    epipolar_lines,
-    fundamental_matrix,
-    plane_angles,
-    triangulate,
-)
+from gcar_deploy.geometry.epipolar import triangulate
 from gcar_deploy.geometry.observability import (
     Observability,
     classes,
@@ -17,10 +12,7 @@ from gcar_deploy.geometry.observability import (
     geometry_sigmas,
     point_sigmas,
     rmse_two_views,
-    silent_errors,
 )
-
-CORNERS = 50.0 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
 def view(a, b=0.0, sod=765.0, sdd=1200.0, **kw):
@@ -115,53 +107,33 @@ def test_curve_bound_is_the_closed_form():
     np.testing.assert_allclose(sigma[seen], expected[seen], rtol=1e-3)
 
 
-def residual_and_error(told, true):
-    pixels = [c.project(CORNERS)[0] for c in true]
-    X, _ = triangulate(told, pixels)
-    rms = np.sqrt(np.mean(np.sum((X - CORNERS) ** 2, axis=1)))
-    s = told[0].pixel_at_isocenter_mm
-    gap = [np.sum((c.project(X)[0] - p) ** 2, axis=1) for c, p in zip(told, pixels, strict=True)]
-    return rms, s * np.sqrt(np.mean(gap))
-
-
-@pytest.mark.parametrize(("theta", "rms"), [(90, 0.51), (60, 0.59), (30, 1.02)])
-def test_a_degree_of_primary_angle_is_silent(theta, rms):
-    told = [view(0), view(theta)]
-    error, residual = residual_and_error(told, [told[0], told[1].turned(1.0)])
-    # The table was drawn for random points; corners of the same cube lie further out.
-    assert 0.8 * rms < error < 2.2 * rms
-    assert residual < 0.05
-
-
-@pytest.mark.parametrize("theta", [90, 60, 30])
-def test_motion_along_the_rotation_axis_shows_and_in_plane_does_not(theta):
-    told = [view(0), view(theta)]
-    _, along = residual_and_error(told, [told[0], told[1].moved((0, 0, 5.0))])
-    across, hidden = residual_and_error(told, [told[0], told[1].moved(5.0 * told[1].axes[0])])
-    assert along > 1.5
-    assert hidden < 0.2 * along and across > 3
-
-
-def test_silent_errors_are_said():
-    sentences = silent_errors([view(0), view(60)])
-    assert len(sentences) == 2
-    assert all("unseen in the pictures" in s and "mm at 60 deg" in s for s in sentences)
-
-
 def test_geometry_prior_grows_as_views_close_up():
     X = np.zeros((1, 3))
     wide, close = (geometry_sigmas([view(0), view(t)], X)[0] for t in (90, 20))
     assert 0.5 < wide < close
 
 
-def test_epipolar_lines_go_through_the_point():
-    pair, rng = [view(-30, -20), view(45, 25)], np.random.default_rng(1)
-    X = rng.uniform(-50, 50, (60, 3))
-    (a, _), (b, _) = pair[0].project(X), pair[1].project(X)
-    lines = epipolar_lines(*pair, a)
-    assert np.abs(np.einsum("ij,ij->i", lines, np.column_stack([b, np.ones(60)]))).max() < 1e-8
-    F = fundamental_matrix(*pair)
-    assert abs(np.linalg.det(F)) < 1e-9
-    np.testing.assert_allclose(
-        plane_angles(*pair, pair[0], a), plane_angles(*pair, pair[1], b), atol=1e-12
-    )
+def test_no_finite_bound_without_a_second_direction():
+    """Two equal views know nothing of the depth; a vessel down both beams is not seen at all."""
+    pair = [view(0), view(0)]
+    sigma, axes = point_sigmas(pair, np.zeros((1, 3)))
+    assert np.isinf(sigma[0, -1]) and abs(axes[0, -1] @ pair[0].axes[2]) == pytest.approx(1)
+    assert np.isinf(curve_sigmas(pair, np.zeros((1, 3)), np.array([[0.0, -1, 0]]))).all()
+    assert classes(np.array([np.inf, 2.0, 5.0, 11.0]), 1.0).tolist() == [2, 0, 1, 2]
+
+
+@pytest.mark.parametrize(("theta", "median", "share"), [(90, 1.27, 0.09), (60, 1.57, 0.12)])
+def test_random_tangents(theta, median, share):
+    """Median of the sigma across the vessel, and the share above 5 s, for random directions."""
+    T = np.random.default_rng(4).normal(size=(20000, 3))
+    T /= np.linalg.norm(T, axis=1, keepdims=True)
+    pair = [far(0), far(theta)]
+    sigma = curve_sigmas(pair, np.zeros((len(T), 3)), T) / pair[0].pixel_at_isocenter_mm
+    assert np.median(sigma) == pytest.approx(median, rel=0.03)
+    assert np.mean(sigma > 5) == pytest.approx(share, abs=0.02)
+
+
+def test_geometry_prior_at_the_edge_of_the_angles():
+    """The finite differences may step over a pole or the back of the gantry."""
+    sigma = geometry_sigmas([view(0), view(180, 90)], np.zeros((1, 3)))
+    assert np.isfinite(sigma).all() and sigma[0] > 0.5

@@ -2,9 +2,12 @@
 
 import copy
 import json
+from importlib import resources
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CArm
@@ -101,6 +104,14 @@ BAD = [
     (changed(("volume", "size_mm"), KeyError), "volume.size_mm is missing"),
     (changed(("volume", "center_mm"), [0, 800, 0]), "from the source"),
     (changed(("volume", "size_mm"), [128, 900, 128]), "behind the detector"),
+    (changed((*FIRST, "principal_point_px"), [1e300, 0]), "is outside -100000 .. 100000"),
+    (changed((*FIRST, "projection_matrix"), [[1e308] * 4] * 3), "is outside -1e+09 .. 1e+09"),
+    (changed((*FIRST, "primary_angle_deg"), None), "primary_angle_deg is missing"),
+    (changed(("schema",), "x" * 9000), "schema = 'xxx"),
+    (changed((*FIRST, "id"), "x" * 9000), "id = 'xxx"),
+    (changed((*FIRST, "x" * 9000), 1), "unknown key 'xxx"),
+    (changed((*FIRST, "intensity"), {"kind": "x" * 9000}), "intensity.kind = 'xxx"),
+    (changed(("volume", "shape"), [1] * 9000), "volume.shape = [1, 1"),
 ]
 
 
@@ -110,6 +121,7 @@ def test_bad_scene_is_one_line_that_says_where(data, message):
         parse_scene(json.dumps(data), "g.json")
     text = str(caught.value)
     assert message in text and text.startswith("g.json: ") and "\n" not in text
+    assert len(text) < 500
 
 
 @pytest.mark.parametrize(
@@ -172,6 +184,39 @@ def test_matrix_alone_is_enough():
     assert other.intensity == Intensity(kind="raw")
 
 
+def matrix_view(**more):
+    carm = parse_scene(json.dumps(SCENE)).views[0].carm
+    own = {"rows": 512, "columns": 512, "projection_matrix": carm.world2pixel.tolist(), **more}
+    return carm, changed(FIRST, own)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"detector_rotation_deg": 3},
+        {"principal_point_px": [250, 250]},
+        {"isocenter_offset_mm": [0, 0, 5]},
+    ],
+)
+def test_nothing_beside_a_lone_matrix_is_ignored(more):
+    with pytest.raises(GeometryError, match="at odds with a lone projection_matrix"):
+        parse_scene(json.dumps(matrix_view(**more)[1]))
+
+
+def test_pixel_spacing_beside_a_lone_matrix_tells_the_detector():
+    carm, data = matrix_view(pixel_spacing_mm=[0.39, 0.39])
+    scene = parse_scene(json.dumps(data))
+    assert scene.views[0].carm.sdd_mm == pytest.approx(carm.sdd_mm)
+    assert scene.views[0].carm.magnification == pytest.approx(carm.magnification)
+    assert scene.warnings == ()
+    assert (
+        "magnification of 1.5 is assumed" in parse_scene(json.dumps(matrix_view()[1])).warnings[0]
+    )
+    for bad, message in (([0.39, 0.5], "disagrees"), ([0.2, 0.2], "must exceed sod_mm")):
+        with pytest.raises(GeometryError, match=message):
+            parse_scene(json.dumps(matrix_view(pixel_spacing_mm=bad)[1]))
+
+
 def test_picture_of_another_size():
     carm = CArm(
         **{k: v for k, v in VIEW.items() if k not in ("intensity", "pixel_spacing_mm")},
@@ -185,22 +230,101 @@ def test_picture_of_another_size():
         match_picture(carm, 256, 512)
 
 
-def test_schema_file_says_the_same():
-    jsonschema = pytest.importorskip("jsonschema")
-    from importlib import resources
+#: what a JSON Schema cannot say: relations between values, and text that is not printable
+BEYOND_SCHEMA = (
+    "must exceed sod_mm",
+    "stands twice",
+    "from the source",
+    "behind the detector",
+    "singular",
+    "skewed",
+    "mirror image",
+    "disagrees with",
+    "mm_per_count is missing",
+    "at odds with a lone",
+    "lies outside the picture",
+    "2^28",
+)
 
-    schema = json.loads(
-        (resources.files("gcar_deploy") / "geometry/geometry.schema.json").read_text()
-    )
-    validator = jsonschema.Draft202012Validator(schema)
+
+def schema_validator():
+    jsonschema = pytest.importorskip("jsonschema")
+    file = resources.files("gcar_deploy") / "geometry/geometry.schema.json"
+    return jsonschema.Draft202012Validator(json.loads(file.read_text()))
+
+
+def agree(validator, data):
+    try:
+        parse_scene(json.dumps(data))
+    except GeometryError as error:
+        beyond = any(text in str(error) for text in BEYOND_SCHEMA)
+        assert beyond or not validator.is_valid(data), f"only the parser refuses: {error}"
+    else:
+        validator.validate(data)
+
+
+def test_schema_file_says_the_same():
+    validator = schema_validator()
     validator.validate(SCENE)
-    checked = [
-        d
-        for d, m in BAD
-        if not any(
-            w in m
-            for w in ("exceed", "twice", "source", "behind", "singular", "mm_per_count is missing")
+    for data, _ in BAD:
+        agree(validator, data)
+    agree(validator, matrix_view()[1])
+    agree(validator, matrix_view(pixel_spacing_mm=[0.39, 0.39])[1])
+
+
+PATHS = [
+    *[(key,) for key in ("schema", "frame", "views", "volume", "more")],
+    *[("volume", key) for key in ("center_mm", "size_mm", "shape", "more")],
+    *[
+        (*FIRST, key)
+        for key in (
+            *VIEW,
+            "id",
+            "detector_rotation_deg",
+            "principal_point_px",
+            "isocenter_offset_mm",
+            "projection_matrix",
+            "more",
         )
-    ]
-    missed = [d for d in checked if validator.is_valid(d)]
-    assert not missed
+    ],
+    *[(*FIRST, "intensity", key) for key in ("kind", "polarity", "mm_per_count", "more")],
+]
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 1200),
+    st.floats(-1e4, 1e4),
+    st.sampled_from([0, 90, 180, 360.5, 512.0, 1e300, 10**400, "raw", "dark", "LPS", ""]),
+)
+VALUES = st.one_of(
+    SCALARS,
+    st.lists(SCALARS, max_size=4),
+    st.lists(st.floats(0.02, 500), min_size=2, max_size=3),
+    st.lists(st.integers(1, 300), min_size=3, max_size=3),
+    st.dictionaries(st.sampled_from(["kind", "polarity", "mm_per_count"]), SCALARS),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(PATHS), st.one_of(VALUES, st.just(KeyError)))
+def test_schema_and_parser_agree_on_any_change(path, value):
+    data = copy.deepcopy(SCENE)
+    data["views"][0]["intensity"]["mm_per_count"] = None
+    data["views"][0].update(id="a", detector_rotation_deg=0, principal_point_px=None)
+    data["views"][0].update(isocenter_offset_mm=None, projection_matrix=None)
+    at = data
+    for key in path[:-1]:
+        at = at[key]
+    if value is KeyError:
+        at.pop(path[-1], None)
+    else:
+        at[path[-1]] = value
+    agree(schema_validator(), data)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text(max_size=60))
+def test_any_text_is_refused_in_one_line(text):
+    with pytest.raises(GeometryError) as caught:
+        parse_scene(text)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500

@@ -1,0 +1,93 @@
+"""Vessel mass over epipolar planes: equal for one tree, whatever the views."""
+
+import numpy as np
+import pytest
+
+from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.consistency import HALF_BINS, disagreement, mass_profiles, vessel_mass
+from gcar_deploy.geometry.epipolar import plane_angles, plane_normal
+
+SIZE = 256
+
+
+def view(a, b, **kw):
+    return CArm(
+        primary_angle_deg=a,
+        secondary_angle_deg=b,
+        sod_mm=765,
+        sdd_mm=1100,
+        rows=SIZE,
+        columns=SIZE,
+        pixel_spacing_mm=(0.8, 0.8),
+        **kw,
+    )
+
+
+PAIR = (view(-30, -20), view(45, 25))
+
+
+def blobs(seed):
+    return np.random.default_rng(seed).normal(scale=20, size=(25, 3))
+
+
+def picture(carm, points):
+    """Path length of equal balls, as small Gaussian spots of equal mass in mm^2 of the patient."""
+    rows, cols = np.mgrid[:SIZE, :SIZE]
+    out = np.zeros((SIZE, SIZE), np.float32)
+    pixels, depth = carm.project(points)
+    for (col, row), z in zip(pixels, depth, strict=True):
+        width = 1.2 * carm.focal_px[0] / z
+        out += np.exp(-0.5 * ((cols - col) ** 2 + (rows - row) ** 2) / width**2)
+    out[out < 1e-4] = 0
+    return out
+
+
+def masses(first, second):
+    return [vessel_mass(c, picture(c, p)) for c, p in zip(PAIR, (first, second), strict=True)]
+
+
+def test_one_tree_agrees_and_two_do_not():
+    same = disagreement(*masses(blobs(0), blobs(0)), PAIR[1], sigma_mm=0.5)
+    other = disagreement(*masses(blobs(0), blobs(1)), PAIR[1], sigma_mm=0.5)
+    assert same < 0.03 and other > 0.3
+
+
+def test_profiles_are_shares_of_the_mass():
+    a, b = mass_profiles(*masses(blobs(0), blobs(0)), PAIR[1], 0.5)
+    assert a.shape == (2 * HALF_BINS + 1,) and a.min() >= 0
+    assert a.sum() == pytest.approx(1, abs=1e-6) and b.sum() == pytest.approx(1, abs=1e-6)
+    assert np.corrcoef(a, b)[0, 1] > 0.98
+
+
+def test_scale_of_the_picture_does_not_matter():
+    image = picture(PAIR[1], blobs(0))
+    fixed = masses(blobs(0), blobs(0))[0]
+    values = [disagreement(fixed, vessel_mass(PAIR[1], k * image), PAIR[1], 0.5) for k in (1, 700)]
+    assert values[0] == pytest.approx(values[1], abs=1e-5)
+
+
+def test_only_motion_across_the_planes_shows():
+    """A patient who moved between the runs: along the normal it shows and is found again."""
+    normal = plane_normal(*PAIR)
+    within = np.cross(normal, PAIR[1].axes[2])
+    across = masses(blobs(0), blobs(0) + 4 * normal)
+    along = masses(blobs(0), blobs(0) + 4 * within)
+    still = disagreement(*masses(blobs(0), blobs(0)), PAIR[1], 0.5)
+    assert disagreement(*across, PAIR[1], 0.5) > still + 0.15
+    assert disagreement(*along, PAIR[1], 0.5) < still + 0.02
+    steps = np.arange(-8, 8.1, 1.0)
+    values = [disagreement(*across, PAIR[1].moved(s * normal), 0.5) for s in steps]
+    assert steps[int(np.argmin(values))] == 4.0
+    assert min(values) < 0.03
+
+
+def test_no_vessel_is_none():
+    assert vessel_mass(PAIR[0], np.zeros((SIZE, SIZE), np.float32)) is None
+
+
+@pytest.mark.parametrize("b", [(0, 0), (180, 0)], ids=["same source", "face to face"])
+def test_views_without_epipolar_planes_are_refused(b):
+    first, second = view(0, 0), view(*b)
+    with pytest.raises(GeometryError, match=r"epipolar planes|face each other"):
+        plane_angles(first, second, first, np.zeros((1, 2)))
