@@ -120,10 +120,12 @@ def test_rescaled_pictures_are_taken_and_that_is_said(good_case, tmp_path):
 
 
 def test_doctor_passes_its_self_test():
+    # Other tests of this process may have imported torch before.
+    before = "torch" in sys.modules
     done = gcar("doctor", "--json")
     assert done.code == 0, done.err
     report = json.loads(done.out)
-    assert report["self_test"]["passed"] and not report["torch_imported"]
+    assert report["self_test"]["passed"] and report["torch_imported"] == before
     assert report["versions"]["numpy"]
 
 

@@ -62,7 +62,10 @@ def test_contract_geometry_fits_real_x_rays():
 
 def test_headers_are_those_of_the_files():
     pydicom = pytest.importorskip("pydicom")
-    folder = data_dir() / "phantom_xa"
+    folders = [data_dir() / "phantom_xa", data_dir() / "data" / "phantom_xa"]
+    folder = next((f for f in folders if f.is_dir()), None)
+    if folder is None:
+        pytest.skip("GCAR_DATA has no phantom_xa")
     for name, header in HEADERS.items():
         d = pydicom.dcmread(folder / f"{name}.dcm", stop_before_pixels=True)
         assert float(d.PositionerPrimaryAngle) == header["primary_angle_deg"]
