@@ -21,10 +21,11 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.resample import sampled
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
-from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.decide import decide
-from gcar_deploy.predict.encoding import encode
+from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.refine.pose import Pose, estimate_poses
 from gcar_deploy.refine.refine import Refined, refine, refined_volume
@@ -47,7 +48,7 @@ def reconstruct(
     grid: Grid,
     options: RunOptions,
     *,
-    predictor: CenterPredictor | None = None,
+    predictor: Predictor | None = None,
     on_progress: OnProgress | None = None,
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
@@ -59,7 +60,7 @@ def reconstruct(
     angiograms : 2 or more pictures with their C-arms
     grid : Grid of the volume that is asked for
     options : RunOptions
-    predictor : CenterPredictor, or None to thin the visual hull instead
+    predictor : of either kind, or None to thin the visual hull instead
     on_progress : called with (stage, share of the work done)
     deadline_s : seconds after which the refinement ends with what it has
     cancel : called often; True ends the work with CancelledError
@@ -90,13 +91,9 @@ def reconstruct(
         quality.check_candidates(len(hull), lattice, options.quality)
         encoded = encode(hull, [(v.carm, v.path_mm, v.calibrated) for v in seen])
     with watch.stage("centers"):
+        centers = _centers(predictor, hull, encoded, views, options)
         if predictor is None:
-            centers = thin_hull(hull, encoded, options.candidates)
             findings.append(_FALLBACK)
-        else:
-            calibrated = all(view.calibrated for view in views)
-            centers = predictor.predict(hull, encoded)
-            centers = decide(centers, encoded, calibrated, options.decide)
     with watch.stage("refine") as report:
         refined = refine(
             centers, views, options.refine, on_progress=report, should_stop=watch.should_stop,
@@ -136,6 +133,23 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
     """Return the edge of the lattice: the grid's own where the predictor knows such cells."""
     own = float(np.mean(grid.spacing_mm))
     return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
+
+
+def _centers(
+    predictor: Predictor | None,
+    hull: Candidates,
+    encoded: Encoded,
+    views: Sequence[VesselImage],
+    options: RunOptions,
+) -> CenterPoints:
+    """Which of the hull's points are vessel."""
+    if predictor is None:
+        return thin_hull(hull, encoded, options.candidates)
+    if isinstance(predictor, SingleViewPredictor):
+        seen = predictor.predict([(view.carm, view.path_mm) for view in views])
+        return merge_views(seen, hull, encoded, options.candidates, options.predict.single)
+    calibrated = all(view.calibrated for view in views)
+    return decide(predictor.predict(hull, encoded), encoded, calibrated, options.decide)
 
 
 def _vessels(

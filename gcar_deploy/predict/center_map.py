@@ -56,6 +56,10 @@ class NetPicture:
         path = np.clip(self.path_mm / self.pixel_mm, 0.0, MAX_PATH_PIXELS) / MAX_PATH_PIXELS
         return np.ascontiguousarray(path[None, None], dtype=np.float32)
 
+    def axes_input(self) -> Array:
+        """(1, 3, 3) float32, the axes u, v, d of the view, for networks that are told the pose."""
+        return np.ascontiguousarray(self.carm.axes[None], dtype=np.float32)
+
     def cells(self, alpha: int) -> Array:
         """(n/alpha, n/alpha) bool: which cells stand for vessel."""
         inside: Array = blocks(self.path_mm, alpha).max(axis=2) > MIN_PATH_PIXELS * self.pixel_mm
@@ -79,12 +83,14 @@ class ViewCenters:
     ray_mm : (n,) distance from the source along the true ray, mm, offsets not included
     cell : (n, 2) int64, (row, col) of each centre's cell
     alpha : int, pixels of the network's picture per cell edge
+    picture : NetPicture that they were predicted from
     """
 
     points_mm: Points
     ray_mm: Scalars
     cell: Array
     alpha: int
+    picture: NetPicture
 
 
 def net_picture(carm: CArm, path_mm: Image, pixels: int) -> NetPicture:
@@ -135,7 +141,26 @@ def decode(output: Array, picture: NetPicture, alpha: int) -> ViewCenters:
         ray_mm=ray_mm,
         cell=np.argwhere(inside),
         alpha=alpha,
+        picture=picture,
     )
+
+
+def single_input_names(pose: bool) -> list[str]:
+    """Names of the graph's inputs, in order; the axes only where it is told the pose."""
+    return ["picture", "axes"] if pose else ["picture"]
+
+
+def golden_inputs(pixels: int, pose: bool) -> list[Array]:
+    """Return the fixed input, (1, 1, n, n) and axes, whose answer a model's spec remembers."""
+    axes = np.array([[[0.8, 0.6, 0.0], [0.0, 0.0, -1.0], [0.6, -0.8, 0.0]]], np.float32)
+    return [_golden_picture(pixels), axes] if pose else [_golden_picture(pixels)]
+
+
+def _golden_picture(pixels: int) -> Array:
+    row, col = np.mgrid[:pixels, :pixels] * (2 * np.pi / pixels)
+    # Two crossing bands with dark between: edges, gradients and empty ground.
+    wave = np.maximum(np.sin(3 * row + np.cos(2 * col)) + np.sin(2 * col - row) - 0.8, 0.0)
+    return np.ascontiguousarray(wave[None, None] / 1.2, dtype=np.float32)
 
 
 def blocks(picture: Array, alpha: int) -> Array:

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import ModelError
+from gcar_deploy.predict.center_map import DEPTH_PIXELS, MAX_PATH_PIXELS, OFFSET_PIXELS
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES
 
 SCHEMA = "gcar-model/1"
+KINDS = ("multi", "single")
 MAX_MODEL_BYTES = 64 * 2**20
-#: name of the model that ``gcar run`` uses unless told otherwise
-DEFAULT_MODEL = "gcp-multi"
+#: the shipped model of each kind; the first is the one that ``gcar run`` uses unless told otherwise
+SHIPPED = {"multi": "gcp-multi", "single": "gcp-single"}
+DEFAULT_MODEL = SHIPPED["multi"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +37,16 @@ class ModelFile:
     spec: dict[str, Any]
     sha256: str
     data: bytes = dataclasses.field(repr=False)
+
+    @property
+    def kind(self) -> str:
+        """``multi`` (all views at once) or ``single`` (one view at a time)."""
+        return str(self.spec["kind"])
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """What the model wants, as its spec says."""
+        return dict(self.spec["inputs"])
 
 
 def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
@@ -69,12 +82,36 @@ def read_model(path: Path) -> ModelFile:
             f"model file {path.name} was altered: its SHA-256 starts {digest[:12]}, "
             f"its spec says {str(spec.get('sha256'))[:12]}"
         )
-    wanted = {"view_features": VIEW_FEATURES, "levels": LEVELS}
-    inputs = spec.get("inputs", {})
-    for key, value in wanted.items():
-        if not isinstance(inputs, dict) or inputs.get(key) != value:
-            raise ModelError(
-                f"model {path.name} wants inputs.{key} = {dict(inputs or {}).get(key)!r}, "
-                f"this version gives {value}"
-            )
+    _check_inputs(path.name, spec)
     return ModelFile(name=str(spec.get("name", path.stem)), spec=spec, sha256=digest, data=data)
+
+
+def _check_inputs(name: str, spec: dict[str, Any]) -> None:
+    """Refuse a model that was made for other inputs than this version gives."""
+    kind, inputs = spec.get("kind"), spec.get("inputs")
+    if kind not in KINDS:
+        raise ModelError(f"model {name} has kind = {kind!r}, which is none of {', '.join(KINDS)}")
+    inputs = inputs if isinstance(inputs, dict) else {}
+    wanted: dict[str, float] = {"view_features": VIEW_FEATURES, "levels": LEVELS}
+    if kind == "single":
+        wanted = {
+            "depth_pixels": DEPTH_PIXELS,
+            "offset_pixels": OFFSET_PIXELS,
+            "max_path_pixels": MAX_PATH_PIXELS,
+        }
+        for key, low, high in (("pixels", 16, 1024), ("alpha", 1, 64)):
+            value = inputs.get(key)
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                raise ModelError(
+                    f"model {name} wants inputs.{key} = {value!r}; a whole number in "
+                    f"{low} .. {high} is understood"
+                )
+        if not isinstance(inputs.get("pose"), bool):
+            raise ModelError(f"model {name} wants inputs.pose = {inputs.get('pose')!r}, not a bool")
+        if inputs["pixels"] % inputs["alpha"]:
+            raise ModelError(f"model {name}: inputs.pixels is no multiple of inputs.alpha")
+    for key, want in wanted.items():
+        if inputs.get(key) != want:
+            raise ModelError(
+                f"model {name} wants inputs.{key} = {inputs.get(key)!r}, this version gives {want}"
+            )
