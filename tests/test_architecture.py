@@ -34,6 +34,7 @@ WALLED = {
     "onnxruntime": {"predict/center_predictor.py"},
     "nibabel": {"output/volume.py"},
     "distributed": {"batch/pools.py"},
+    "pydicom": {"output/dicom_stl.py"},
     "flask": {"worker/http.py"},
     "waitress": {"worker/http.py"},
 }
