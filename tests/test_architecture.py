@@ -23,7 +23,7 @@ FLOORS = {
     "selftest": 6, "data": 6,
     "reconstruct": 7,
     "engine": 8,
-    "inspection": 9,
+    "inspection": 9, "worker": 9, "batch": 9,
     "cli": 10,
 }  # fmt: skip
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load
@@ -34,6 +34,9 @@ WALLED = {
     "onnxruntime": {"predict/center_predictor.py"},
     "nibabel": {"output/volume.py"},
     "pydicom": {"dicom/header.py", "dicom/frames.py"},
+    "distributed": {"batch/pools.py"},
+    "flask": {"worker/http.py"},
+    "waitress": {"worker/http.py"},
 }
 
 
