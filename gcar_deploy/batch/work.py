@@ -34,7 +34,7 @@ class BatchJob:
 
     case: str
     views: tuple[str, ...]
-    geometry: str
+    geometry: str | None
     out: str
     marker: str | None
     fingerprint: str

@@ -121,6 +121,50 @@ def predictor_options(function: _Function) -> _Function:
     return function
 
 
+def dicom_options(function: _Function) -> _Function:
+    """Add what a DICOM file may leave open; arguments ``frame``, ``spacing``, ``sod``."""
+    for option in (
+        click.option(
+            "--sod",
+            type=click.FloatRange(300, 5000),
+            default=None,
+            metavar="MM",
+            help="DICOM without it: source to isocentre.",
+        ),
+        click.option(
+            "--pixel-spacing",
+            "spacing",
+            type=click.FloatRange(0.02, 10),
+            default=None,
+            metavar="MM",
+            help="DICOM without it: pixel spacing at the detector.",
+        ),
+        click.option(
+            "--frame",
+            default="auto",
+            show_default=True,
+            metavar="N|auto",
+            help="DICOM: frame of the run, from 1; one for all files, or 7,12 for each.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def chosen_dicom(frame: str, spacing: float | None, sod: float | None) -> Any:
+    """Return DicomOptions; a wrong ``--frame`` is a UsageError."""
+    from gcar_deploy.config import DicomOptions
+    from gcar_deploy.errors import UsageError
+
+    frames: list[int | None] = []
+    for word in frame.split(","):
+        text = word.strip()
+        if text != "auto" and not (text.isascii() and text.isdigit() and len(text) < 7):
+            raise UsageError(f"--frame {frame[:40]!r} must be auto, a number, or one for each file")
+        frames.append(None if text == "auto" else int(text))
+    return DicomOptions(frames=tuple(frames), pixel_spacing_mm=spacing, sod_mm=sod)
+
+
 @contextlib.contextmanager
 def needs_extra(extra: str, *packages: str) -> Iterator[None]:
     """Turn a missing library of an extra into one line that says what to install.

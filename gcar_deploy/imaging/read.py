@@ -50,7 +50,7 @@ def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple
     limits = limits or PictureLimits()
     path = Path(path)
     try:
-        data = _read_bytes(path, limits.max_bytes)
+        data = read_bytes(path, limits.max_bytes)
         pixels, depth = _decode(data, path.suffix.lower(), limits)
     except ValueError as error:
         raise ImageError(f"{path.name}: {error}") from None
@@ -59,7 +59,14 @@ def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple
     return pixels, depth, sha256
 
 
-def _read_bytes(path: Path, max_bytes: int) -> bytes:
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file whole, if it is not larger than ``max_bytes``.
+
+    Raises
+    ------
+    ValueError
+        What is wrong, without the file's name.
+    """
     try:
         # O_NONBLOCK: a named pipe must be refused, not waited for.
         handle = os.open(
