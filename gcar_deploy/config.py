@@ -120,7 +120,7 @@ class PoseOptions:
     angle_sigma_deg: float = 0.7
     #: first search along the direction that two views see best, mm
     search_mm: float = 12.0
-    step_mm: float = 0.5
+    step_mm: float = 1.0
     #: smoothing of the mass profiles, mm at the isocentre
     coarse_mm: float = 1.5
     fine_mm: float = 0.5
