@@ -33,7 +33,7 @@ WALLED = {
     "torch": {"gaussians/torch_project.py"},
     "onnxruntime": {"predict/center_predictor.py"},
     "nibabel": {"output/volume.py"},
-    "pydicom": {"dicom/header.py", "dicom/frames.py"},
+    "pydicom": {"dicom/header.py", "dicom/frames.py", "output/dicom_stl.py"},
     "distributed": {"batch/pools.py"},
     "flask": {"worker/http.py"},
     "waitress": {"worker/http.py"},

@@ -106,7 +106,7 @@ def _job(
     return BatchJob(
         case=case.name,
         views=tuple(str(path.absolute()) for path in case.views),
-        geometry=str(case.geometry.absolute()),
+        geometry=None if case.geometry is None else str(case.geometry.absolute()),
         out=str((out / case.name).absolute()),
         marker=str((rows / f"{case.name}.running").absolute()) if scheduler is None else None,
         fingerprint=fingerprint,

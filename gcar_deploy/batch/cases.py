@@ -23,16 +23,16 @@ MOST_CASES = 100_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BatchCase:
-    """One case: its name (also of its folder), pictures and geometry file."""
+    """One case: its name (also of its folder), pictures and geometry file (None for DICOM)."""
 
     name: str
     views: tuple[Path, ...]
-    geometry: Path
+    geometry: Path | None
 
     def fingerprint(self, options: Mapping[str, Any]) -> str:
         """SHA-256 of everything the result depends on; unreadable files count as absent."""
         digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
-        for path in (self.geometry, *self.views):
+        for path in (*([self.geometry] if self.geometry else []), *self.views):
             try:
                 content = hashlib.sha256(path.read_bytes()).digest()
             except OSError:
@@ -43,6 +43,8 @@ class BatchCase:
 
 def read_cases(table: Path) -> list[BatchCase]:
     """Read ``case,geom,view1,view2[,view3 ...]``; paths are relative to the table.
+
+    ``geom`` may be empty where the views are DICOM XA.
 
     Raises
     ------
@@ -100,10 +102,9 @@ def _case(table: Path, number: int, line: Mapping[Any, Any], columns: list[str])
         cells.pop()
     if len(cells) < 2 or not all(cells):
         raise UsageError(f"{where}: two or more views, without a gap, are needed")
-    geometry = (line["geom"] or "").strip()
-    if not geometry:
-        raise UsageError(f"{where}: geom is empty")
-    folder = table.parent
+    geometry, folder = (line["geom"] or "").strip(), table.parent
     return BatchCase(
-        name=name, views=tuple(folder / cell for cell in cells), geometry=folder / geometry
+        name=name,
+        views=tuple(folder / cell for cell in cells),
+        geometry=folder / geometry if geometry else None,
     )

@@ -29,7 +29,8 @@ p { color: #5b6675; }
 _SHOWN = (
     ("status", "Status", ""), ("branches", "Branches", ""), ("length_mm", "Length", " mm"),
     ("separation_deg", "View separation", " deg"), ("least_coverage", "Least coverage", ""),
-    ("seconds", "Time", " s"), ("sentence", "Why", ""),
+    ("largest_stenosis_percent", "Largest stenosis", " %"), ("seconds", "Time", " s"),
+    ("sentence", "Why", ""),
 )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from gcar_deploy.errors import CancelledError, GcarError, RefusedError
 #: columns of summary.csv, in order
 COLUMNS = (
     "case", "status", "exit_code", "sentence", "branches", "length_mm", "gaussians",
-    "separation_deg", "least_coverage", "seconds",
+    "separation_deg", "least_coverage", "largest_stenosis_percent", "seconds",
 )  # fmt: skip
 
 
@@ -34,7 +34,7 @@ class BatchJob:
 
     case: str
     views: tuple[str, ...]
-    geometry: str
+    geometry: str | None
     out: str
     marker: str | None
     fingerprint: str
@@ -107,6 +107,8 @@ def _solved(job: BatchJob) -> dict[str, Any]:
 
 def _row(case: str, summary: Mapping[str, Any]) -> dict[str, Any]:
     coverage = [view["coverage"] for view in summary["views"] if view["coverage"] is not None]
+    stenoses = [branch["stenosis_percent"] for branch in summary["tree"]["branches"]]
+    known = [percent for percent in stenoses if percent is not None]
     return {
         "case": case,
         "status": summary["status"],
@@ -117,5 +119,6 @@ def _row(case: str, summary: Mapping[str, Any]) -> dict[str, Any]:
         "gaussians": summary["counts"]["gaussians"],
         "separation_deg": round(summary["separation_deg"], 2),
         "least_coverage": round(min(coverage), 4) if coverage else None,
+        "largest_stenosis_percent": round(max(known), 1) if known else None,
         "seconds": round(summary["seconds"]["total"], 3),
     }

@@ -38,6 +38,10 @@ from gcar_deploy.cli.common import (
 @dicom_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
+@click.option("--glb", is_flag=True, help="Write surface.glb as well.")
+@click.option(
+    "--dicom-stl", is_flag=True, help="Write surface.dcm (DICOM Encapsulated STL) as well."
+)
 @output_options
 def run(
     views: tuple[Path, ...],
@@ -53,6 +57,8 @@ def run(
     sod: float | None,
     strict: bool,
     force: bool,
+    glb: bool,
+    dicom_stl: bool,
     verbose: bool,
     quiet: bool,
     as_json: bool,
@@ -76,7 +82,10 @@ def run(
 
     check_target(out_dir, force=force, inputs=(*views, *([geom] if geom else [])))
     from gcar_deploy.engine import Engine
+    from gcar_deploy.output.bundle import check_extras
 
+    extras = [name for name, wanted in (("glb", glb), ("dicom-stl", dicom_stl)) if wanted]
+    check_extras(extras)
     options = run_options(predictor, refiner)
     options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
     engine = Engine(model, threads=threads, options=options)
@@ -87,7 +96,7 @@ def run(
     if strict and result.status != "ok":
         with refusals_as_json(as_json):
             raise RefusedError(f"degraded, and --strict was given: {result.quality.sentence}")
-    result.save(out_dir, force=force)
+    result.save(out_dir, force=force, extras=extras)
     if as_json:
         click.echo(json.dumps({"out": str(out_dir), **result.summary()}, allow_nan=False))
     else:

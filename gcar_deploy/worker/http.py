@@ -227,7 +227,7 @@ def _order(folder: AllowedFolder | None) -> Order:
 
 
 def _uploaded(folder: AllowedFolder | None) -> Order:
-    """Read an order of parts ``view`` (in order), ``geometry`` and, at will, ``options``."""
+    """Read an order of parts ``view`` (in order), and at will ``geometry`` and ``options``."""
     files: list[FileStorage] = request.files.getlist("view")
     unknown = (set(request.files) | set(request.form)) - {"view", "geometry", "options"}
     if unknown:
@@ -237,7 +237,10 @@ def _uploaded(folder: AllowedFolder | None) -> Order:
     options = check_keys(_json("options", "{}"))
     if "views" in options or "geometry" in options:
         raise UsageError("options: views and geometry are parts of their own")
-    geometry = _json("geometry", None)
+    # Only DICOM views may do without; the engine says so.
+    geometry = _json("geometry", "null")
+    if not isinstance(geometry, (dict, type(None))):
+        raise UsageError("part geometry must be the content of a geom.json")
     if options.get("out") is not None and folder is None:
         raise UsageError("out needs a worker that was started with --folder")
     common = common_fields(options, folder)
@@ -254,7 +257,7 @@ def _uploaded(folder: AllowedFolder | None) -> Order:
     return Order(views=tuple(views), geometry=geometry, scratch=scratch, **common)
 
 
-def _json(part: str, default: str | None) -> Any:
+def _json(part: str, default: str) -> Any:
     """JSON of a form field, or of a small file of that name."""
     text = request.form.get(part, default)
     if part in request.files:
@@ -262,8 +265,6 @@ def _json(part: str, default: str | None) -> Any:
         if len(data) > _MOST_FIELDS:
             raise UsageError(f"part {part}: larger than {_MOST_FIELDS >> 20} MiB")
         text = data.decode("utf-8", "replace")
-    if text is None:
-        raise UsageError(f"part {part} is missing")
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

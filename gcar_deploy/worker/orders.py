@@ -28,7 +28,7 @@ class Order:
     Attributes
     ----------
     views : picture files, in the order of the geometry's views
-    geometry : content of ``geom.json``, or the file
+    geometry : content of ``geom.json``, or the file; None where DICOM headers tell it
     out : result folder asked for; None keeps it beside the job
     force : replace an existing result folder
     strict : take a degraded result for a refusal
@@ -37,7 +37,7 @@ class Order:
     """
 
     views: tuple[Path, ...]
-    geometry: Mapping[str, Any] | Path
+    geometry: Mapping[str, Any] | Path | None
     out: Path | None = None
     force: bool = False
     strict: bool = False
@@ -50,8 +50,8 @@ def parse_order(values: Any, folder: AllowedFolder | None) -> Order:
 
     Parameters
     ----------
-    values : JSON object with ``views`` and ``geometry``, and at will ``out``, ``force``,
-        ``strict``, ``deadline_s``
+    values : JSON object with ``views`` and ``geometry`` (unless the views are DICOM), and at
+        will ``out``, ``force``, ``strict``, ``deadline_s``
     folder : every file must lie in it, and is copied first; None takes any path as it is
 
     Raises
@@ -65,7 +65,7 @@ def parse_order(values: Any, folder: AllowedFolder | None) -> Order:
         raise UsageError("views must be a list of file names")
     if not 2 <= len(names) <= MOST_VIEWS:
         raise UsageError(f"views has {len(names)} entries; 2 .. {MOST_VIEWS} are taken")
-    if not isinstance(geometry, (str, dict)):
+    if not isinstance(geometry, (str, dict, type(None))):
         raise UsageError("geometry must be the content of a geom.json, or a file name")
     common = common_fields(values, folder)
     if folder is None:

@@ -167,7 +167,6 @@ def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
         ("case,geom,view1,view2\n../a,g,1,2\n", "line 2: case '../a'"),
         ("case,geom,view1,view2\nrows,g,1,2\n", "'rows'"),
         ("case,geom,view1,view2\na,g,1,2\nA,g,1,2\n", "line 3: case 'A' stands there twice"),
-        ("case,geom,view1,view2\na,,1,2\n", "geom is empty"),
         ("case,geom,view1,view2\na,g,1,\n", "two or more views"),
         ("case,geom,view1,view2,view3\na,g,1,,3\n", "without a gap"),
     ],

@@ -169,6 +169,14 @@ def test_what_gcar_run_would_refuse_is_told_with_its_exit_code(serving):
     assert job["state"] == "refused" and job["error"]["exit_code"] == 6
 
 
+def test_pictures_without_a_geometry_are_told_so(serving):
+    ask, folder = serving
+    body, kind = multipart(parts_of(folder)[:2])
+    job = ask("POST", "/v1/reconstruct?wait=60", body, Content_Type=kind).json()
+    assert job["state"] == "failed" and job["error"]["exit_code"] == 2
+    assert "geometry is needed" in job["error"]["message"]
+
+
 def test_bad_bodies(serving):
     ask, folder = serving
     post = lambda body, kind: ask("POST", "/v1/reconstruct", body, Content_Type=kind)  # noqa: E731
@@ -177,7 +185,7 @@ def test_bad_bodies(serving):
     good = parts_of(folder)
     for parts, words in (
         (good[1:], "1 parts"),
-        (good[:2], "geometry is missing"),
+        ([*good[:2], ("geometry", None, b"3")], "content of a geom.json"),
         ([*good, ("more", None, b"1")], "unknown part"),
         ([*good[:2], ("geometry", None, b"{")], "not JSON"),
         ([*good, ("options", None, b'{"views": []}')], "parts of their own"),
