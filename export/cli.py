@@ -238,6 +238,22 @@ def verify(model: Path, scenes: int) -> None:
     click.echo(verify_model(model, scenes))
 
 
+@main.command()
+@click.argument("model", type=_FILE)
+@click.option("--force", is_flag=True, help="Replace an existing golden case.")
+def golden(model: Path, force: bool) -> None:
+    """Write MODEL's golden case: a small input, and what the model says to it today.
+
+    It is run whenever the model is loaded; another answer is refused.
+
+    Example: gcar-export golden models/gcp-multi.onnx
+    """
+    from gcar_export.golden import write_golden
+
+    path = write_golden(model, force=force)
+    click.echo(f"{path}: {path.stat().st_size} bytes")
+
+
 @main.command("tree-table")
 @click.option(
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
