@@ -67,11 +67,11 @@ def enhance(
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
     from gcar_deploy.imaging.extract import extract_vessels
-    from gcar_deploy.imaging.pictures import vessel_pictures, write_folder
+    from gcar_deploy.imaging.pictures import png_files
     from gcar_deploy.imaging.read import read_picture
+    from gcar_deploy.output.folder import check_target, write_folder
 
-    if out_dir.exists() and not force:
-        raise UsageError(f"{out_dir} exists; choose another folder or add --force")
+    check_target(out_dir, force=force, inputs=(picture,))
     if kind == "path_length" and mm_per_count is None:
         raise UsageError("--kind path_length needs --mm-per-count")
     options = ImagingOptions()
@@ -82,10 +82,10 @@ def enhance(
         click.echo("\n".join(f"gcar: {note}" for note in run.notes), err=True)
     else:
         pixels, valid = read_picture(picture, options.limits), None
-    angiogram = Angiogram.without_geometry(picture.stem, pixels, intensity, pixel_mm)
+    angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
     angiogram = dataclasses.replace(angiogram, valid=valid)
     found = extract_vessels(angiogram, options)
-    write_folder(out_dir, vessel_pictures(found), force=force)
+    write_folder(out_dir, png_files(found), force=force)
     length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
     click.echo(
         f"{out_dir}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "
