@@ -81,7 +81,7 @@ class Stopwatch:
         return float("inf") if self._deadline_s is None else self._deadline_s - self.elapsed_s
 
     def leaving(self, reserve_s: float) -> Callable[[], bool]:
-        """Return a question for iterations: is the deadline ``reserve_s`` away, or nearer?
+        """Return a question for iterations: whether the deadline is ``reserve_s`` away or nearer.
 
         Asking raises CancelledError once the caller has cancelled.
         """
