@@ -270,3 +270,22 @@ def tree_table(data: Path | None, count: int) -> None:
     with click.progressbar(range(count), label="generated", file=sys.stderr) as seeds:
         generated = [generated_statistics(seed) for seed in seeds]
     click.echo(table(generated, [real_statistics(path) for path in real]))
+
+
+@main.command("lumen-table")
+@click.option(
+    "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
+)
+@click.option("--count", default=30, show_default=True, help="Cases, one stenosis each.")
+def lumen_table(data: Path | None, count: int) -> None:
+    """Measure stenosis, radius and branch lengths on trees with one known stenosis.
+
+    Left trees, the clinical views, stenoses of 30 .. 70 % of the diameter, 8 .. 16 mm long.
+
+    Example: gcar-export lumen-table --data data --count 27
+    """
+    from gcar_export.lumen_table import lumen_rows, table
+
+    with click.progressbar(length=count, label="cases", file=sys.stderr) as bar:
+        rows = lumen_rows(data, count, lambda: bar.update(1))
+    click.echo(table(rows))
