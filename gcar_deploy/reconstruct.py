@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy import quality
+from gcar_deploy import alternatives, quality
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -89,13 +89,14 @@ def reconstruct(
         hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
         encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
+    told = None
     with watch.stage("centers"):
         if predictor is None:
             centers = thin_hull(hull, encoded, options.candidates)
             findings.append(_FALLBACK)
         else:
             calibrated = all(view.calibrated for view in views)
-            centers = predictor.predict(hull, encoded)
+            centers = told = predictor.predict(hull, encoded)
             centers = decide(centers, encoded, calibrated, options.decide)
     with watch.stage("refine") as report:
         refined = refine(
@@ -115,6 +116,11 @@ def reconstruct(
     with watch.stage("quality", keep_if_late=True):
         lumen = [_lumen(tree, view, options) for view in views]
         worst = max(p.after for p in poses)
+        open_ = alternatives.exchanges(tree, [view.carm for view in views])
+        elsewhere = None if told is None else alternatives.evidence_elsewhere(
+            tree, told, encoded.ray, encoded.weight
+        )  # fmt: skip
+        findings += alternatives.findings(open_, elsewhere)
         judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
@@ -123,7 +129,7 @@ def reconstruct(
         counts={
             "candidates": len(hull), "gaussians": len(refined.gaussians.means_mm),
             "branches": len(tree.branches), "steps": refined.steps,
-            "rejected_steps": refined.rejected_steps,
+            "rejected_steps": refined.rejected_steps, "alternatives": len(open_),
         },
         losses=tuple(refined.losses), predictor=centers.source, refiner=options.refine.refiner,
         model=None if predictor is None

@@ -18,6 +18,7 @@ VERBS = {
     "validate": ("gcar_deploy.cli.validate", "Check pictures and geometry; reconstruct nothing."),
     "enhance": ("gcar_deploy.cli.enhance", "Show the steps of finding vessels in one picture."),
     "demo": ("gcar_deploy.cli.demo", "Reconstruct the case that comes along."),
+    "bench": ("gcar_deploy.cli.bench", "Measure speed against error."),
     "doctor": ("gcar_deploy.cli.doctor", "Check this installation."),
     "info": ("gcar_deploy.cli.info", "Print what a result folder or a model is."),
 }
