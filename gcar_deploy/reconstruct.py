@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy import quality
+from gcar_deploy import alternatives, quality
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -96,6 +96,7 @@ def reconstruct(
         quality.check_candidates(len(hull), lattice, options.quality)
         watch.check()
         encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
+    told = None
     with watch.stage("centers"):
         if predictor is None:
             centers = thin_hull(hull, encoded, options.candidates)
@@ -104,7 +105,7 @@ def reconstruct(
             calibrated = all(view.calibrated for view in views)
             try:
                 stop = watch.should_stop if watch.interruptible else None
-                centers = predictor.predict(hull, encoded, stop)
+                centers = told = predictor.predict(hull, encoded, stop)
             except CancelledError:
                 watch.check()
                 raise
@@ -133,6 +134,11 @@ def reconstruct(
     with watch.stage("quality", keep_if_late=True):
         lumen = [_lumen(tree, view, options) for view in views]
         worst = max(p.after for p in poses)
+        open_ = alternatives.exchanges(tree, [view.carm for view in views])
+        elsewhere = None if told is None else alternatives.evidence_elsewhere(
+            tree, told, encoded.ray, encoded.weight
+        )  # fmt: skip
+        findings += alternatives.findings(open_, elsewhere)
         judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
@@ -141,7 +147,7 @@ def reconstruct(
         counts={
             "candidates": len(hull), "gaussians": len(refined.gaussians.means_mm),
             "branches": len(tree.branches), "steps": refined.steps,
-            "rejected_steps": refined.rejected_steps,
+            "rejected_steps": refined.rejected_steps, "alternatives": len(open_),
         },
         losses=tuple(refined.losses), predictor=centers.source, refiner=how.refiner,
         model=None if predictor is None
