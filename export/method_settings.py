@@ -58,6 +58,10 @@ BASELINES = ("fdk", "sart", "visual_hull", "nerp")
 #: the paper's refinement from an FBP start ("3DGR-FBP").
 FBP_PAPER = "fbp+paper"
 METHODS = (*RUNTIME_ROWS, FBP_PAPER, *BASELINES)
+#: options of the runtime that a simulated case depends on (not: how files are read).
+_STAGES = (
+    "imaging", "pose", "candidates", "predict", "decide", "tree", "refine", "quality",
+)  # fmt: skip
 #: method -> one line for tables and reports.
 DESCRIPTIONS: Mapping[str, str] = {
     OURS: "gcar as it comes: multi-view predictor, tube refinement",
@@ -141,7 +145,7 @@ class MethodSettings:
         if method in RUNTIME_ROWS:
             options = self.run_options(method)
             out = {
-                "run": dataclasses.asdict(options),
+                "run": {k: v for k, v in dataclasses.asdict(options).items() if k in _STAGES},
                 "swapped": RUNTIME_ROWS[method].swapped,
                 "models": _model_hashes(options.predict.predictor),
             }
