@@ -16,6 +16,40 @@ class PictureLimits:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class DicomLimits:
+    """What a DICOM run may be before any of its pixels is decoded."""
+
+    max_bytes: int = 512 * 2**20
+    #: pixels; each side of a frame
+    min_side: int = 16
+    max_side: int = 4096
+    max_frames: int = 2000
+    #: of all frames together
+    max_pixels: int = 2**30
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DicomOptions:
+    """From a DICOM run to one picture with its geometry."""
+
+    limits: DicomLimits = dataclasses.field(default_factory=DicomLimits)
+    #: frame of each run, counted from 1, None to choose; one entry holds for all runs
+    frames: tuple[int | None, ...] = (None,)
+    #: for files that do not say it: pixel spacing at the detector, source to isocentre, mm
+    pixel_spacing_mm: float | None = None
+    sod_mm: float | None = None
+    #: frames filled to this share of the best are compared by their stillness
+    filled_share: float = 0.9
+    #: a frame named by the file but filled less than this share of the best is worth a word
+    least_filled_share: float = 0.5
+    #: tilt of the detector against the beam: said above the first, refused above the second
+    good_tilt_deg: float = 0.1
+    max_tilt_deg: float = 1.0
+    #: share by which SDD / SOD may differ from the file's own magnification factor
+    magnification_share: float = 0.02
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelLimits:
     """What a model file may be before ONNX Runtime sees it."""
 
@@ -105,7 +139,7 @@ class PoseOptions:
     angle_sigma_deg: float = 0.7
     #: first search along the direction that two views see best, mm
     search_mm: float = 12.0
-    step_mm: float = 0.5
+    step_mm: float = 1.0
     #: smoothing of the mass profiles, mm at the isocentre
     coarse_mm: float = 1.5
     fine_mm: float = 0.5
@@ -325,6 +359,7 @@ class QualityOptions:
 class RunOptions:
     """Everything ``reconstruct`` needs to know beside pictures and geometry."""
 
+    dicom: DicomOptions = dataclasses.field(default_factory=DicomOptions)
     imaging: ImagingOptions = dataclasses.field(default_factory=ImagingOptions)
     pose: PoseOptions = dataclasses.field(default_factory=PoseOptions)
     candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)

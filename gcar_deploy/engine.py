@@ -13,9 +13,12 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.dicom.header import is_dicom
+from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.geometry.scene import Scene, load_scene, match_picture, parse_scene
+from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
@@ -86,7 +89,7 @@ class Engine:
     def reconstruct(
         self,
         views: Sequence[Picture],
-        geometry: Geometry,
+        geometry: Geometry | None = None,
         *,
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
@@ -97,7 +100,7 @@ class Engine:
         Parameters
         ----------
         views : 2 or more pictures, in the order of the geometry's views
-        geometry : where they were taken from
+        geometry : where they were taken from; None where DICOM headers say it
         on_progress : called with (stage, share of the work done) from the calling thread
         deadline_s : seconds after which the refinement ends with what it has (``degraded``)
         cancel : callable, for instance ``threading.Event().is_set``
@@ -122,7 +125,7 @@ class Engine:
 
 
 def prepare(
-    views: Sequence[Picture], geometry: Geometry, options: RunOptions
+    views: Sequence[Picture], geometry: Geometry | None, options: RunOptions
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pair pictures with their views.
 
@@ -141,6 +144,8 @@ def prepare(
     """
     if len(views) < 2:
         raise UsageError(f"{len(views)} picture given; two or more are needed")
+    if geometry is None:
+        return _from_headers(views, options)
     given = [view for view in views if isinstance(view, Angiogram)]
     if isinstance(geometry, Grid):
         if len(given) != len(views):
@@ -153,20 +158,22 @@ def prepare(
         )
     notes = list(scene.warnings)
     angiograms = []
+    frames = _frames_for(views, options)
     for picture, view in zip(views, scene.views, strict=True):
         if isinstance(picture, Angiogram):
             angiograms.append(picture)
+            continue
+        if isinstance(picture, (str, Path)) and is_dicom(picture):
+            run = read_run(picture, options.dicom, frames.pop(0))
+            carm = _matched(view, run.pixels.shape, notes)
+            angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
+            notes += run.notes
             continue
         if isinstance(picture, np.ndarray):
             pixels, depth, sha256 = _from_array(view.id, picture, options.imaging.limits)
         else:
             pixels, depth, sha256 = read_picture(picture, options.imaging.limits)
-        try:
-            carm, note = match_picture(view.carm, *pixels.shape)
-        except GeometryError as error:
-            raise GeometryError(f"view {view.id}: {error}") from None
-        if note:
-            notes.append(f"view {view.id}: {note}")
+        carm = _matched(view, pixels.shape, notes)
         angiograms.append(
             Angiogram(
                 view_id=view.id,
@@ -178,6 +185,39 @@ def prepare(
             )
         )
     return angiograms, scene.volume_grid(), notes
+
+
+def _from_headers(
+    views: Sequence[Picture], options: RunOptions
+) -> tuple[list[Angiogram], Grid, list[str]]:
+    """Pictures whose own headers tell the geometry: DICOM XA alone."""
+    paths = [view for view in views if isinstance(view, (str, Path))]
+    for path in paths:
+        if not is_dicom(path):
+            raise UsageError(
+                f"{Path(path).name} is no DICOM file: its geometry is needed (--geom geom.json)"
+            )
+    if len(paths) != len(views):
+        raise UsageError("pictures in memory tell no geometry: give a scene")
+    angiograms, scene, notes = read_views(paths, options.dicom)
+    return angiograms, scene.volume_grid(), notes
+
+
+def _frames_for(views: Sequence[Picture], options: RunOptions) -> list[int | None]:
+    """Frame of each DICOM file among the pictures, in their order."""
+    runs = sum(isinstance(view, (str, Path)) and is_dicom(view) for view in views)
+    return list(wanted_frames(options.dicom, runs)) if runs else []
+
+
+def _matched(view: View, shape: tuple[int, ...], notes: list[str]) -> CArm:
+    """Fit a view to the size of its picture; what was rescaled is added to ``notes``."""
+    try:
+        carm, note = match_picture(view.carm, shape[0], shape[1])
+    except GeometryError as error:
+        raise GeometryError(f"view {view.id}: {error}") from None
+    if note:
+        notes.append(f"view {view.id}: {note}")
+    return carm
 
 
 def _from_array(

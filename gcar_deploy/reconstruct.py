@@ -19,7 +19,7 @@ from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.imaging.resample import sampled
+from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
 from gcar_deploy.predict.center_predictor import CenterPredictor
@@ -85,10 +85,10 @@ def reconstruct(
         views = [_posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
         lattice = cubic_lattice(grid, cell_mm(grid, options))
-        seen = [sampled(view, float(lattice.spacing_mm[0])) for view in views]
-        hull = visual_hull([(v.carm, v.path_mm) for v in seen], lattice, options.candidates)
+        seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
+        hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
-        encoded = encode(hull, [(v.carm, v.path_mm, v.calibrated) for v in seen])
+        encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
     with watch.stage("centers"):
         if predictor is None:
             centers = thin_hull(hull, encoded, options.candidates)
@@ -157,8 +157,7 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
         fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
-    small = [sampled(view, options.predict.min_cell_mm) for view in views]
-    return estimate_poses([(view.carm, view.path_mm) for view in small], pose)
+    return estimate_poses([sampled_path(v, options.predict.min_cell_mm) for v in views], pose)
 
 
 def _posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import click
+
+from gcar_deploy.cli.common import chosen_dicom
 
 
 @click.command("enhance")
@@ -39,6 +42,7 @@ import click
     default=None,
     help="For --kind path_length: millimetres of vessel per count.",
 )
+@click.option("--frame", default="auto", show_default=True, help="DICOM: frame, from 1.")
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
 def enhance(
     picture: Path,
@@ -47,6 +51,7 @@ def enhance(
     polarity: str,
     pixel_mm: float | None,
     mm_per_count: float | None,
+    frame: str,
     force: bool,
 ) -> None:
     r"""Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
@@ -55,7 +60,9 @@ def enhance(
     Example:
       gcar enhance view1.png --out steps
     """
-    from gcar_deploy.config import ImagingOptions
+    from gcar_deploy.config import DicomOptions, ImagingOptions
+    from gcar_deploy.dicom.header import is_dicom
+    from gcar_deploy.dicom.scene import read_run
     from gcar_deploy.errors import UsageError
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
@@ -69,9 +76,14 @@ def enhance(
         raise UsageError("--kind path_length needs --mm-per-count")
     options = ImagingOptions()
     intensity = Intensity(kind=kind, polarity=polarity, mm_per_count=mm_per_count)
-    angiogram = Angiogram.without_geometry(
-        "picture", read_picture(picture, options.limits), intensity, pixel_mm
-    )
+    if is_dicom(picture):
+        run = read_run(picture, DicomOptions(), chosen_dicom(frame, None, None).frames[0])
+        pixels, valid = (run.pixels, run.header.bits, run.header.sha256), run.valid
+        click.echo("\n".join(f"gcar: {note}" for note in run.notes), err=True)
+    else:
+        pixels, valid = read_picture(picture, options.limits), None
+    angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
+    angiogram = dataclasses.replace(angiogram, valid=valid)
     found = extract_vessels(angiogram, options)
     write_folder(out_dir, png_files(found), force=force)
     length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm

@@ -34,6 +34,8 @@ class Angiogram:
         What a count means.
     sha256 : str
         Of the bytes of the file.
+    valid : (rows, cols) bool or None
+        Where the file itself says that there is a picture (shutters); None for everywhere.
     """
 
     view_id: str
@@ -42,9 +44,12 @@ class Angiogram:
     bit_depth: int
     intensity: Intensity
     sha256: str
+    valid: Mask | None = None
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)
+        if self.valid is not None:
+            _check_shape(self.view_id, self.carm, self.valid)
 
     @classmethod
     def without_geometry(

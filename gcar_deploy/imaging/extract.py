@@ -70,7 +70,8 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
         )
     path = np.asarray(angiogram.pixels * np.float32(scale), dtype=np.float32)
     smallest = options.path_threshold_pixels * angiogram.carm.pixel_at_isocenter_mm
-    mask = path > smallest
+    valid = np.ones(path.shape, bool) if angiogram.valid is None else angiogram.valid
+    mask = (path > smallest) & valid
     if not mask.any():
         raise _nothing(angiogram, f"no path is longer than {smallest:.2g} mm")
     if mask.mean() > 0.9:
@@ -82,7 +83,7 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
         calibrated=True,
         mask=mask,
         skeleton=skel.skeletonize(mask),
-        valid=np.ones_like(mask),
+        valid=valid,
         kind="path_length",
     )
 
@@ -92,6 +93,8 @@ def _from_grey(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     dark = is_dark(angiogram, options)
     pictures, holes = bright_vessels(pixels, kind, dark, options)
+    if angiogram.valid is not None:
+        holes = holes | ~angiogram.valid
     search = pictures.get("search", next(iter(pictures.values())))
     found = segment.segment(search, holes, pixel_mm, options)
     length = found.skeleton.sum() * pixel_mm

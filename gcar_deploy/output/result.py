@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
+from gcar_deploy.tree.lumen import BranchLumen, bifurcation_angles, branch_lumens
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Volume
 
@@ -26,6 +27,10 @@ RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or tr
 _PACKAGES = (
     "gcar", "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "onnxruntime",
     "nibabel",
+)  # fmt: skip
+_LUMEN = (
+    "/minimal_diameter_mm", "/minimal_at_mm", "/reference_diameter_mm", "/stenosis_percent",
+    "/lesion_length_mm",
 )  # fmt: skip
 
 
@@ -88,7 +93,13 @@ class Result:
             "views": [self._view(k) for k in range(len(self.views))],
             "tree": {
                 "length_mm": self.tree.length_mm,
-                "branches": [_branch(branch) for branch in self.tree.branches],
+                "branches": [
+                    _branch(branch, lumen)
+                    for branch, lumen in zip(
+                        self.tree.branches, branch_lumens(self.tree), strict=True
+                    )
+                ],
+                "bifurcations": bifurcations(self.tree),
             },
             "volume": {
                 "center_mm": list(self.grid.center_mm),
@@ -106,6 +117,9 @@ class Result:
             "use": RESEARCH_USE,
         }
         out: dict[str, Any] = plain(body, "", reasons)
+        for path in reasons:
+            if path.startswith("/tree/branches/") and path.endswith(_LUMEN):
+                reasons[path] = "the branch is too short to state a stenosis"
         if self.model is None:
             reasons["/model"] = "made without a model"
         out["reasons"] = reasons
@@ -115,11 +129,17 @@ class Result:
         """``summary`` as strict JSON text."""
         return json.dumps(self.summary(), indent=1, allow_nan=False) + "\n"
 
-    def save(self, out_dir: str | Path, *, force: bool = False) -> Path:
-        """Write the result folder, all or nothing; see ``output.bundle``."""
+    def save(self, out_dir: str | Path, *, force: bool = False, extras: Sequence[str] = ()) -> Path:
+        """Write the result folder, all or nothing; see ``output.bundle``.
+
+        Parameters
+        ----------
+        force : replace an existing folder
+        extras : of ``glb`` (surface.glb) and ``dicom-stl`` (surface.dcm)
+        """
         from gcar_deploy.output.bundle import write_result
 
-        return write_result(self, Path(out_dir), force=force)
+        return write_result(self, Path(out_dir), force=force, extras=extras)
 
     def _view(self, k: int) -> dict[str, Any]:
         angiogram, judged, pose = self.angiograms[k], self.quality.views[k], self.poses[k]
@@ -155,7 +175,23 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def _branch(branch: Branch) -> dict[str, Any]:
+def bifurcations(tree: Tree) -> list[dict[str, Any]]:
+    """Nodes where three or more branches meet, with the angle between each two of them.
+
+    Branches are counted from 0, as in ``branches``.
+    """
+    found: dict[int, dict[str, Any]] = {}
+    for angle in bifurcation_angles(tree):
+        place = tree.nodes_mm[angle.node].tolist()
+        node = found.setdefault(
+            angle.node, {"node": angle.node, "position_mm": place, "angles": []}
+        )
+        pair = {"branches": [angle.first, angle.second], "angle_deg": angle.angle_deg}
+        node["angles"].append(pair)
+    return list(found.values())
+
+
+def _branch(branch: Branch, lumen: BranchLumen) -> dict[str, Any]:
     known = branch.sigma_mm[np.isfinite(branch.sigma_mm)]
     return {
         "start": branch.start,
@@ -165,6 +201,11 @@ def _branch(branch: Branch) -> dict[str, Any]:
         "min_radius_mm": float(branch.radius_mm.min()),
         "mean_sigma_mm": float(known.mean()) if len(known) else None,
         "confidence": float(branch.confidence.mean()),
+        "minimal_diameter_mm": lumen.minimal_diameter_mm,
+        "minimal_at_mm": lumen.minimal_at_mm,
+        "reference_diameter_mm": lumen.reference_diameter_mm,
+        "stenosis_percent": lumen.stenosis_percent,
+        "lesion_length_mm": lumen.lesion_length_mm,
     }
 
 
