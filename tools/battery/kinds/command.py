@@ -55,9 +55,6 @@ _WORDS = (
 def make(seed: int) -> Case:
     """Return the fuzz case of command lines."""
     # Imported before the fork, so that every child has them already.
-    import gcar_deploy.cli.main
-    import gcar_deploy.engine
-    import gcar_deploy.inspection
     import gcar_export.cli
     import gcar_export.export_onnx  # noqa: F401
 
@@ -130,7 +127,11 @@ def _here(program: str, line: list[str], folder: Path) -> tuple[int, str, str]:
                 export.main(line, prog_name="gcar-export")
         except SystemExit as stop:
             code = stop.code
-    return (code if isinstance(code, int) else 0 if code is None else 1), out.getvalue(), err.getvalue()
+    return (
+        (code if isinstance(code, int) else 0 if code is None else 1),
+        out.getvalue(),
+        err.getvalue(),
+    )
 
 
 def _process(program: str, line: list[str], folder: Path) -> tuple[int, str, str]:
@@ -143,13 +144,15 @@ def _process(program: str, line: list[str], folder: Path) -> tuple[int, str, str
 
     if any("\x00" in word for word in line):
         line = [word.replace("\x00", "") for word in line]
-    done = subprocess.run(  # noqa: S603 - our own interpreter
+    done = subprocess.run(
         [sys.executable, "-c", code, *line],
         capture_output=True, cwd=folder, preexec_fn=limit, timeout=280, check=False,
         stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    return done.returncode, done.stdout.decode("utf-8", "replace"), done.stderr.decode(
-        "utf-8", "replace"
+    return (
+        done.returncode,
+        done.stdout.decode("utf-8", "replace"),
+        done.stderr.decode("utf-8", "replace"),
     )
 
 

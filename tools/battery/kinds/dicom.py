@@ -69,7 +69,7 @@ def _other_values(data: bytes, rng) -> bytes:
             else:
                 setattr(dataset, keyword, value)
             changed = as_bytes(dataset)
-        except Exception:  # noqa: BLE001, S112 - the library will not write such a value: no case
+        except Exception:  # noqa: BLE001 - the library will not write such a value: no case
             dataset = pydicom.dcmread(pydicom.filebase.DicomBytesIO(data))
             continue
         data = changed

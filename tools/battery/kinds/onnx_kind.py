@@ -97,7 +97,7 @@ def _other_graph(original: bytes, rng: random.Random) -> bytes:
     elif action == 7:
         node.domain = rng.choice(("com.microsoft", "x", "ai.onnx.ml"))
     else:
-        shape = helper.make_tensor("big", TensorProto.INT64, [2], [2**rng.randrange(41), 2**20])
+        shape = helper.make_tensor("big", TensorProto.INT64, [2], [2 ** rng.randrange(41), 2**20])
         graph.initializer.append(shape)
         graph.node.insert(0, helper.make_node("ConstantOfShape", ["big"], ["bigger"]))
         node.input[0] = "bigger"
