@@ -60,7 +60,7 @@ def faults(kills: int, signals: int, seed: int) -> None:
 @click.option("--hash-seeds", default=5, show_default=True)
 @click.option("--case", type=click.Choice(["tiny", "demo"]), default="tiny", show_default=True)
 def determinism(repeats: int, threads: str, hash_seeds: int, case: str) -> None:
-    """Check that the same input gives the same bytes: cold, warm, any hash seed; 1e-6 between numbers of threads.
+    """Check for same bytes: cold, warm, any hash seed; 1e-6 between numbers of threads.
 
     Example: python -m tools.battery determinism --case demo
     """

@@ -47,8 +47,9 @@ _EXPORT = (
 )
 _WORDS = (
     "", "-", "--", "--help", "-v", "--json", "--force", "--fast", "nan", "-1", "0", "1e999", "inf",
-    "9" * 400, "\u202e", "a" * 5000, ".", "/", "/dev/null", "/dev/full", "V", "O", "D", "G", "P",
-    "--out", "--geom", "--threads", "--model", "--deadline", "--predictor", "tube", "none", "\udcff",
+    "9" * 400, "\u202e", "a" * 5000, ".", "/", "/dev/null", "/dev/full", "V", "O", "D", "G",
+    "P", "--out", "--geom", "--threads", "--model", "--deadline", "--predictor", "tube", "none",
+    "\udcff",
 )  # fmt: skip
 
 
@@ -76,7 +77,7 @@ def make(seed: int) -> Case:
 
 
 def _files(folder: Path, rng: random.Random) -> dict[str, str]:
-    """A case on disk with one file damaged half of the time, and paths to what is asked for."""
+    """Write a case with one file damaged half of the time, and name the paths."""
     write_case(folder / "case")
     paths = {
         "V": folder / "case" / "view1.png", "W": folder / "case" / "view2.png",
