@@ -11,7 +11,7 @@ from pathlib import Path
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output.folder import write_folder
 from gcar_deploy.output.glb import glb_bytes
-from gcar_deploy.output.overlay import overlay, png_bytes
+from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
 from gcar_deploy.output.result import Result
 from gcar_deploy.output.tables import (
@@ -63,16 +63,20 @@ def render_files(result: Result, extras: Sequence[str] = ()) -> dict[str, bytes]
             stl_bytes(surface), [angiogram.sha256 for angiogram in result.angiograms]
         )
     files = {name: make() for name, make in makers.items()}
-    overlays = [
+    pictures = [
         overlay(angiogram.pixels, view, result.tree, judged, result.options.quality)
         for angiogram, view, judged in zip(
             result.angiograms, result.views, result.quality.views, strict=True
         )
     ]
-    for number, picture in enumerate(overlays, start=1):
+    for number, picture in enumerate(pictures, start=1):
         files[f"overlay_view{number}.png"] = png_bytes(picture)
     summary = result.summary()
-    files["report.html"] = report_html(result, summary, overlays).encode("utf-8")
+    backdrops = [
+        backdrop(angiogram.pixels, view, result.tree, result.options.quality)[0]
+        for angiogram, view in zip(result.angiograms, result.views, strict=True)
+    ]
+    files["report.html"] = report_html(result, summary, backdrops).encode("utf-8")
     summary["files"] = {
         name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         for name, data in files.items()

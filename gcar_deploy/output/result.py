@@ -18,6 +18,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
+from gcar_deploy.tree.further_view import best_further_view
 from gcar_deploy.tree.lumen import BranchLumen, bifurcation_angles, branch_lumens
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Volume
@@ -82,6 +83,7 @@ class Result:
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
         reasons: dict[str, str] = {}
+        further = best_further_view(self.tree, [view.carm for view in self.views])
         body = {
             "schema": SCHEMA,
             "status": self.quality.status,
@@ -106,6 +108,7 @@ class Result:
                 "size_mm": list(self.grid.size_mm),
                 "shape": list(self.grid.shape),
             },
+            "best_further_view": None if further is None else dataclasses.asdict(further),
             "counts": dict(self.counts),
             "losses": list(self.losses),
             "seconds": dict(self.seconds),

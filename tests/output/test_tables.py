@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.output.report import _jpeg, _scene, report_html
+from gcar_deploy.output.report import _jpeg, report_html
+from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.tables import centerline_csv, centerline_vtp, gaussians_npz, gaussians_ply
 from gcar_deploy.tree.tree import Branch, Tree
 
@@ -91,10 +92,11 @@ def long_tree(branches=40, points=400):
 def test_report_stays_small_for_noisy_pictures_and_long_trees(result):
     tree = long_tree()
     long = dataclasses.replace(result, tree=tree)
-    noise = np.random.default_rng(0).integers(0, 255, (1024, 1024, 3), dtype=np.uint8)
-    assert len(report_html(long, long.summary(), [noise, noise])) < 1_500_000
-    drawn = _scene(long)["branches"]
-    assert sum(len(branch["points"]) for branch in drawn) < 3500
+    noise = np.random.default_rng(0).normal(120, 12, (512, 512)).clip(0, 255).astype(np.uint8)
+    picture = np.repeat(np.kron(noise, np.ones((2, 2), np.uint8))[..., None], 3, axis=2)
+    assert len(report_html(long, long.summary(), [picture, picture])) < 500_000
+    drawn = scene_data(long, None)["branches"]
+    assert sum(len(branch["points"]) for branch in drawn) < 2100
     assert all(branch["arc"][-1] == pytest.approx(tree.branches[0].length_mm, abs=0.01)
                for branch in drawn)  # fmt: skip
 
