@@ -27,6 +27,16 @@ class _Group(click.Group):
         except KeyboardInterrupt:
             click.echo("interrupted", err=True)
             sys.exit(130)
+        except (click.ClickException, click.Abort, click.exceptions.Exit):
+            raise
+        except ImportError as error:
+            click.echo(f"error: {error.name} is missing; pip install 'gcar[export]'", err=True)
+            sys.exit(1)
+        except Exception as error:
+            logging.getLogger("gcar_export").info("internal error", exc_info=True)
+            detail = (str(error).splitlines() or [""])[0][:200]
+            click.echo(f"error: internal: {type(error).__name__} {detail}; see -v", err=True)
+            sys.exit(1)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
