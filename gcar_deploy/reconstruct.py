@@ -13,12 +13,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy import quality
+from gcar_deploy.advice import advise
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
@@ -26,6 +28,7 @@ from gcar_deploy.predict.center_predictor import CenterPredictor
 from gcar_deploy.predict.decide import decide
 from gcar_deploy.predict.encoding import encode
 from gcar_deploy.predict.thinning import thin_hull
+from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose, estimate_poses
 from gcar_deploy.refine.refine import Refined, refine, refined_volume
 from gcar_deploy.refine.tube_model import footprint, tubes_of
@@ -48,6 +51,7 @@ def reconstruct(
     options: RunOptions,
     *,
     predictor: CenterPredictor | None = None,
+    segmenter: Segmenter | None = None,
     on_progress: OnProgress | None = None,
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
@@ -60,6 +64,7 @@ def reconstruct(
     grid : Grid of the volume that is asked for
     options : RunOptions
     predictor : CenterPredictor, or None to thin the visual hull instead
+    segmenter : Segmenter, where ``options.imaging.segmenter`` asks for one
     on_progress : called with (stage, share of the work done)
     deadline_s : seconds after which the refinement ends with what it has
     cancel : called often; True ends the work with CancelledError
@@ -73,12 +78,16 @@ def reconstruct(
     """
     if len(angiograms) < 2:
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
+    landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
     watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel)
     findings = quality.check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        views = _vessels(angiograms, options, report)
+        views = _vessels(angiograms, options, segmenter, report)
     with watch.stage("pose"):
         poses = poses_between(views, options)
+        findings += quality.check_poses(
+            views, [(p.shift_mm, p.turn_deg) for p in poses], options.quality
+        )
         findings += quality.check_consistency(
             views, [p.after for p in poses], options.quality, [p.partner for p in poses]
         )
@@ -116,6 +125,7 @@ def reconstruct(
         lumen = [_lumen(tree, view, options) for view in views]
         worst = max(p.after for p in poses)
         judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
+        further = advise(tree, [view.carm for view in views])
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=tuple(views), poses=poses,
@@ -128,7 +138,7 @@ def reconstruct(
         losses=tuple(refined.losses), predictor=centers.source, refiner=options.refine.refiner,
         model=None if predictor is None
         else {"name": predictor.model.name, "sha256": predictor.model.sha256},
-        notes=(), options=options,
+        notes=(), options=options, advice=further,
     )  # fmt: skip
 
 
@@ -139,11 +149,14 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
 
 
 def _vessels(
-    angiograms: Sequence[Angiogram], options: RunOptions, report: Callable[[float], None]
+    angiograms: Sequence[Angiogram],
+    options: RunOptions,
+    segmenter: Segmenter | None,
+    report: Callable[[float], None],
 ) -> list[VesselImage]:
     views = []
     for angiogram in angiograms:
-        views.append(extract_vessels(angiogram, options.imaging))
+        views.append(extract_vessels(angiogram, options.imaging, segmenter))
         report(len(views) / len(angiograms))
     return views
 
@@ -158,7 +171,14 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
     small = [sampled(view, options.predict.min_cell_mm) for view in views]
-    return estimate_poses([(view.carm, view.path_mm) for view in small], pose)
+    marks = landmark_pixels(options.landmarks, [view.carm for view in views])
+    for k, (view, coarse) in enumerate(zip(views, small, strict=True)):
+        scale = np.array([coarse.carm.columns, coarse.carm.rows]) / (
+            view.carm.columns,
+            view.carm.rows,
+        )
+        marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
+    return estimate_poses([(view.carm, view.path_mm) for view in small], pose, marks)
 
 
 def _posed(view: VesselImage, pose: Pose) -> VesselImage:

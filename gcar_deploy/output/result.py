@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from gcar_deploy.advice import Advice
 from gcar_deploy.config import RunOptions
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
@@ -50,6 +52,7 @@ class Result:
     model : name and SHA-256 of the model, None without one
     notes : sentences for the user that do not lower the status
     options : RunOptions
+    advice : the further view that would help most, or None
     """
 
     quality: Quality
@@ -68,6 +71,7 @@ class Result:
     model: Mapping[str, str] | None
     notes: tuple[str, ...]
     options: RunOptions
+    advice: Advice | None = None
 
     @property
     def status(self) -> str:
@@ -86,6 +90,8 @@ class Result:
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],
+            "silent_errors": list(silent_errors([view.carm for view in self.views])),
+            "advice": self._advice(),
             "tree": {
                 "length_mm": self.tree.length_mm,
                 "branches": [_branch(branch) for branch in self.tree.branches],
@@ -106,6 +112,8 @@ class Result:
             "use": RESEARCH_USE,
         }
         out: dict[str, Any] = plain(body, "", reasons)
+        if self.advice is None:
+            reasons["/advice"] = "no further view would help much"
         if self.model is None:
             reasons["/model"] = "made without a model"
         out["reasons"] = reasons
@@ -120,6 +128,11 @@ class Result:
         from gcar_deploy.output.bundle import write_result
 
         return write_result(self, Path(out_dir), force=force)
+
+    def _advice(self) -> dict[str, Any] | None:
+        if self.advice is None:
+            return None
+        return {**dataclasses.asdict(self.advice), "sentence": self.advice.sentence}
 
     def _view(self, k: int) -> dict[str, Any]:
         angiogram, judged, pose = self.angiograms[k], self.quality.views[k], self.poses[k]
@@ -138,6 +151,13 @@ class Result:
             "support": judged.support,
             "distance_mm": judged.distance_mm,
             "overlap": judged.overlap,
+            "coverage_2px": judged.coverage_2px,
+            "match_rate": judged.match_rate,
+            "foreshortening": judged.foreshortening,
+            "disagreement_before": pose.before,
+            "disagreement_after": pose.after,
+            "landmark_gap_before_mm": pose.landmark_before_mm,
+            "landmark_gap_after_mm": pose.landmark_after_mm,
             "estimated_offset_mm": list(pose.offset_mm),
             "estimated_primary_deg": pose.primary_deg,
             "estimated_secondary_deg": pose.secondary_deg,

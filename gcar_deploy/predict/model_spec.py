@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ SCHEMA = "gcar-model/1"
 MAX_MODEL_BYTES = 64 * 2**20
 #: name of the model that ``gcar run`` uses unless told otherwise
 DEFAULT_MODEL = "gcp-multi"
+#: name of the network that finds vessels in raw pictures
+SEGMENTER_MODEL = "segmenter"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +45,13 @@ def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
     return path if path.is_file() else None
 
 
-def read_model(path: Path) -> ModelFile:
+def read_model(path: Path, wanted: Mapping[str, Any] | None = None) -> ModelFile:
     """Read and verify an ONNX file and the spec beside it.
+
+    Parameters
+    ----------
+    path : of the ONNX file
+    wanted : what its spec must say of ``inputs``; by default those of the centre predictor
 
     Raises
     ------
@@ -69,7 +77,7 @@ def read_model(path: Path) -> ModelFile:
             f"model file {path.name} was altered: its SHA-256 starts {digest[:12]}, "
             f"its spec says {str(spec.get('sha256'))[:12]}"
         )
-    wanted = {"view_features": VIEW_FEATURES, "levels": LEVELS}
+    wanted = wanted or {"view_features": VIEW_FEATURES, "levels": LEVELS}
     inputs = spec.get("inputs", {})
     for key, value in wanted.items():
         if not isinstance(inputs, dict) or inputs.get(key) != value:
