@@ -168,21 +168,43 @@ def _numbers(text: str) -> tuple[int, ...]:
 @main.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
 @click.option(
+    "--network",
+    type=click.Choice(["multi", "single"]),
+    default="multi",
+    show_default=True,
+    help="The predictor that sees all views, or the paper's that sees one.",
+)
+@click.option(
     "--preset", type=click.Choice(["cpu", "gpu", "tiny"]), default="cpu", show_default=True
 )
-@click.option("--steps", type=int, help="Steps in all; overrides the preset.")
-@click.option("--decay-steps", type=int, help="Length of the final linear decay.")
-@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
+@click.option("--steps", type=click.IntRange(1), help="Steps in all; overrides the preset.")
+@click.option("--decay-steps", type=click.IntRange(1), help="Length of the final linear decay.")
+@click.option(
+    "--minutes", type=click.FloatRange(0), help="Stop after so long; the same command goes on."
+)
+@click.option(
+    "--labels",
+    type=_FOLDER,
+    help="Label volumes of your own (.nii, .nii.gz, .nrrd, .mha, .mhd): half of the scenes.",
+)
 def train(
-    out: Path, preset: str, steps: int | None, decay_steps: int | None, minutes: float | None
+    out: Path,
+    network: str,
+    preset: str,
+    steps: int | None,
+    decay_steps: int | None,
+    minutes: float | None,
+    labels: Path | None,
 ) -> None:
-    """Train the multi-view predictor on generated trees; stop and go on at will.
+    """Train a predictor on generated trees; stop and go on at will.
 
-    Example: gcar-export train --out runs/a --minutes 60
+    Example: gcar-export train --network single --out runs/a --minutes 60
     """
     from gcar_export.train import start
 
-    start(out, preset, steps=steps, decay_steps=decay_steps, minutes=minutes)
+    start(
+        out, network, preset, steps=steps, decay_steps=decay_steps, minutes=minutes, labels=labels
+    )
 
 
 @main.command()
@@ -214,6 +236,22 @@ def verify(model: Path, scenes: int) -> None:
     from gcar_export.verify import verify_model
 
     click.echo(verify_model(model, scenes))
+
+
+@main.command()
+@click.argument("model", type=_FILE)
+@click.option("--force", is_flag=True, help="Replace an existing golden case.")
+def golden(model: Path, force: bool) -> None:
+    """Write MODEL's golden case: a small input, and what the model says to it today.
+
+    It is run whenever the model is loaded; another answer is refused.
+
+    Example: gcar-export golden models/gcp-multi.onnx
+    """
+    from gcar_export.golden import write_golden
+
+    path = write_golden(model, force=force)
+    click.echo(f"{path}: {path.stat().st_size} bytes")
 
 
 @main.command("tree-table")

@@ -6,6 +6,7 @@ Scene i of seed s is a function of (s, i) alone, so a run can stop and go on any
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -31,6 +32,40 @@ class SceneOptions:
     exact_share: float = 0.65
     misplaced_share: float = 0.2
     more_views_share: float = 0.12
+    #: scenes drawn from users' label volumes where some are given
+    label_share: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Capsules:
+    """A tree as capsules: (n, 3) starts and ends in mm LPS, (n,) radii in mm."""
+
+    starts: np.ndarray
+    ends: np.ndarray
+    radii: np.ndarray
+
+    def moved(self, shift_mm: np.ndarray) -> Capsules:
+        """Return the tree moved by (3,) mm."""
+        return Capsules(self.starts + shift_mm, self.ends + shift_mm, self.radii)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LabelTree:
+    """A user's tree: whole, and its left and right side where the label tells them apart."""
+
+    whole: Capsules
+    sides: tuple[Capsules, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Examination:
+    """A tree and the C-arm views that it is seen from; ``h`` is the lattice's cell, mm."""
+
+    tree: Capsules
+    carms: list[CArm]
+    h: float
+    shape: int
+    paper: bool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,33 +82,65 @@ class TrainingScene:
     kind: str
 
 
-def training_scene(seed: int, i: int, options: SceneOptions | None = None) -> TrainingScene:
+def training_scene(
+    seed: int,
+    i: int,
+    options: SceneOptions | None = None,
+    labels: Sequence[LabelTree] = (),
+) -> TrainingScene:
     """Draw scene ``i``; draws again (with a stated sub-seed) where a scene is unusable."""
     options = options or SceneOptions()
     for attempt in range(20):
         rng = np.random.default_rng([seed, i, attempt])
-        scene = _draw(rng, options)
+        scene = _draw(rng, options, labels)
         if scene is not None:
             return scene
     raise RuntimeError(f"no usable scene for seed {seed}, index {i}")
 
 
-def _draw(rng: np.random.Generator, options: SceneOptions) -> TrainingScene | None:
+def examination(
+    rng: np.random.Generator, options: SceneOptions, labels: Sequence[LabelTree] = ()
+) -> Examination | None:
+    """Draw a tree and its views; None where the tree does not fit into the cube."""
     paper = rng.random() < options.paper_share
+    if labels and rng.random() < options.label_share:
+        tree = _label_tree(rng, labels, paper)
+    else:
+        tree = _generated(rng, paper)
+    views = 2
+    if rng.random() < options.more_views_share:
+        views = int(rng.integers(3, 7))
+    carms, h, shape = _paper_views(rng, views) if paper else _clinical_views(rng, views)
+    spread = np.maximum(np.abs(tree.starts).max(), np.abs(tree.ends).max())
+    if spread > 0.5 * h * shape - 2:
+        return None
+    return Examination(tree, carms, h, shape, paper)
+
+
+def _generated(rng, paper):
     tree = random_tree(rng)
     if not paper:
         tree = (
             tree.sides("left" if rng.random() < 0.65 else "right") if rng.random() < 0.8 else tree
         )
-    starts, ends, radii = tree.segments()
-    views = 2
-    if rng.random() < options.more_views_share:
-        views = int(rng.integers(3, 7))
-    carms, h, shape = _paper_views(rng, views) if paper else _clinical_views(rng, views)
-    spread = np.maximum(np.abs(starts).max(), np.abs(ends).max())
-    if spread > 0.5 * h * shape - 2:
+    return Capsules(*tree.segments())
+
+
+def _label_tree(rng, labels, paper):
+    label = labels[int(rng.integers(len(labels)))]
+    if paper or not label.sides or rng.random() > 0.8:
+        return label.whole
+    return label.sides[int(rng.integers(len(label.sides)))]
+
+
+def _draw(
+    rng: np.random.Generator, options: SceneOptions, labels: Sequence[LabelTree]
+) -> TrainingScene | None:
+    drawn = examination(rng, options, labels)
+    if drawn is None:
         return None
-    shift = rng.uniform(-0.5, 0.5, size=3) * h
+    carms, h, shape, paper = drawn.carms, drawn.h, drawn.shape, drawn.paper
+    tree = drawn.tree.moved(rng.uniform(-0.5, 0.5, size=3) * h)
     exact = rng.random() < options.exact_share
     misplaced = rng.random() < options.misplaced_share
     pictures = []
@@ -81,15 +148,15 @@ def _draw(rng: np.random.Generator, options: SceneOptions) -> TrainingScene | No
         true_carm = carm
         if misplaced and k:
             true_carm = carm.moved(rng.normal(size=3) * rng.uniform(0, 0.6) * h)
-        path = _picture(rng, true_carm, starts + shift, ends + shift, radii)
+        path = picture(rng, true_carm, tree)
         if not exact:
-            path = _degrade(rng, path, h)
+            path = degrade(rng, path, h)
         pictures.append((carm, path, exact))
     grid = Grid(center_mm=(0.0, 0.0, 0.0), size_mm=(h * shape,) * 3, shape=(shape,) * 3)
     hull = visual_hull([(c, p) for c, p, _ in pictures], grid, CandidateOptions())
     if not 500 < len(hull) < MAX_POINTS:
         return None
-    truth, offset, radius = occupancy(hull.points_mm, h, starts + shift, ends + shift, radii)
+    truth, offset, radius = occupancy(hull.points_mm, h, tree.starts, tree.ends, tree.radii)
     return TrainingScene(
         encoded=encode(hull, pictures),
         points_mm=hull.points_mm,
@@ -147,17 +214,17 @@ def _clinical_views(rng, n):
             return carms, h, 128
 
 
-def _picture(rng, carm, starts, ends, radii):
+def picture(rng: np.random.Generator, carm: CArm, tree: Capsules) -> np.ndarray:
     """Point-sampled rays at network size, or a finer picture averaged down to it."""
     factor = 1 if rng.random() < 0.5 else int(rng.integers(2, 5))
     fine = carm.resized(carm.rows * factor, carm.columns * factor)
-    path = path_lengths(fine, starts, ends, radii)
+    path = path_lengths(fine, tree.starts, tree.ends, tree.radii)
     if factor > 1:
         path = cv2.resize(path, (carm.columns, carm.rows), interpolation=cv2.INTER_AREA)
     return path
 
 
-def _degrade(rng, path, h):
+def degrade(rng: np.random.Generator, path: np.ndarray, h: float) -> np.ndarray:
     """Unknown contrast, blur, noise, a wandering mask, gaps: what segmentation leaves us."""
     mask = (path > 0.3 * h).astype(np.uint8)
     out = path.copy()

@@ -166,6 +166,7 @@ def export_checked(checkpoint: Path, out: Path, scenes: int) -> Parity:
     """
     from gcar_deploy.errors import ModelError
     from gcar_export.dataset import training_scene
+    from gcar_export.golden import write_golden
 
     export_sparse(checkpoint, out, training_scene(PARITY_SEED, 0).encoded)
     found = parity(checkpoint, out, (training_scene(PARITY_SEED, i).encoded for i in range(scenes)))
@@ -176,4 +177,5 @@ def export_checked(checkpoint: Path, out: Path, scenes: int) -> Parity:
             f"{out.name} differs from its checkpoint by {found.worst:.1e} of the range "
             f"(at most {PARITY:g}); {found.decisions_equal:.4%} of decisions equal"
         )
+    write_golden(out, force=True)
     return found

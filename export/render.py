@@ -97,6 +97,26 @@ def _union(order, pixel, t0, t1, image):
             end = t1[i]
 
 
+@numba.njit(cache=True)
+def _longest(order, pixel, t0, t1, image, middle):
+    """Sum stretches into ``image`` and put the middle of the longest one into ``middle``."""
+    current, start, end, best = -1, 0.0, -1e30, 0.0
+    for k in range(len(order) + 1):
+        i = order[k] if k < len(order) else -1
+        if i >= 0 and pixel[i] == current and t0[i] <= end:
+            end = max(end, t1[i])
+            continue
+        if current >= 0:
+            image[current] += end - start
+            if end - start > best:
+                best, middle[current] = end - start, 0.5 * (start + end)
+        if i < 0:
+            break
+        if pixel[i] != current:
+            current, best = pixel[i], 0.0
+        start, end = t0[i], t1[i]
+
+
 def path_lengths(carm: CArm, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """Path length through the union of capsules at each pixel centre.
 
@@ -109,19 +129,48 @@ def path_lengths(carm: CArm, starts: np.ndarray, ends: np.ndarray, radii: np.nda
     -------
     (rows, columns) float32, mm
     """
+    pixel, t0, t1 = _intervals(carm, starts, ends, radii)
+    image = np.zeros(carm.rows * carm.columns)
+    _union(np.lexsort((t0, pixel)), pixel, t0, t1, image)
+    return image.reshape(carm.rows, carm.columns).astype(np.float32)
+
+
+def path_and_depth(
+    carm: CArm, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Path length and depth along the true ray of each pixel centre.
+
+    Takes what ``path_lengths`` takes.
+
+    Returns
+    -------
+    path : (rows, columns) float32, mm
+    depth : (rows, columns) float64
+        Distance from the source, along the ray, of the middle of the longest unbroken stretch
+        of vessel, mm; NaN where there is none.
+    """
+    pixel, t0, t1 = _intervals(carm, starts, ends, radii)
+    image = np.zeros(carm.rows * carm.columns)
+    middle = np.full(carm.rows * carm.columns, np.nan)
+    _longest(np.lexsort((t0, pixel)), pixel, t0, t1, image, middle)
+    shape = (carm.rows, carm.columns)
+    return image.reshape(shape).astype(np.float32), middle.reshape(shape)
+
+
+def _intervals(carm, starts, ends, radii):
+    """Pixel, entry and exit (mm from the source) of every meeting of a ray and a capsule."""
     boxes = _boxes(carm, starts, ends, radii)
     inside = (boxes[:, 0] <= boxes[:, 1]) & (boxes[:, 2] <= boxes[:, 3])
     a, b, r, boxes = starts[inside], ends[inside], radii[inside], boxes[inside]
-    image = np.zeros(carm.rows * carm.columns)
-    if len(r):
-        source, inverse = carm.source_mm, np.linalg.inv(carm.world2pixel[:, :3])
-        empty_i, empty_f = np.empty(0, np.int64), np.empty(0)
-        args = (a, b, r, boxes, source, inverse, carm.columns)
-        n = _collect(*args, False, empty_i, empty_f, empty_f)
-        pixel, t0, t1 = np.empty(n, np.int64), np.empty(n), np.empty(n)
-        _collect(*args, True, pixel, t0, t1)
-        _union(np.lexsort((t0, pixel)), pixel, t0, t1, image)
-    return image.reshape(carm.rows, carm.columns).astype(np.float32)
+    empty_i, empty_f = np.empty(0, np.int64), np.empty(0)
+    if not len(r):
+        return empty_i, empty_f, empty_f
+    source, inverse = carm.source_mm, np.linalg.inv(carm.world2pixel[:, :3])
+    args = (a, b, r, boxes, source, inverse, carm.columns)
+    n = _collect(*args, False, empty_i, empty_f, empty_f)
+    pixel, t0, t1 = np.empty(n, np.int64), np.empty(n), np.empty(n)
+    _collect(*args, True, pixel, t0, t1)
+    return pixel, t0, t1
 
 
 def _boxes(carm, starts, ends, radii):

@@ -1,7 +1,8 @@
 """Make the test model: a sparse predictor of a few hundred weights, from a seed.
 
-``python -m gcar_export.tiny_model tests/data`` writes ``tiny.onnx`` and ``tiny.json``, through
-the same export as a real checkpoint, so tests exercise the true ONNX path in milliseconds.
+``python -m gcar_export.tiny_model tests/data`` writes ``tiny.onnx`` with its spec and
+golden case, through the same export as a real checkpoint, so tests exercise the true ONNX path
+in milliseconds.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from safetensors.torch import save_file
 
 from gcar_export.dataset import training_scene
 from gcar_export.export_onnx import export_sparse
+from gcar_export.golden import write_golden
 from gcar_export.networks.sparse import SparseConfig, SparsePredictor
 
 TINY = SparseConfig(width=(3, 2, 2, 2), stages=1, ray_width=1)
@@ -48,6 +50,7 @@ def main(out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         checkpoint = write_tiny_checkpoint(Path(folder))
         spec = export_sparse(checkpoint, out / "tiny.onnx", training_scene(0, 0).encoded)
+    write_golden(out / "tiny.onnx", force=True)
     click.echo(f"{out / 'tiny.onnx'}: {spec['bytes']} bytes, {spec['parameters']} parameters")
 
 

@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 
 from gcar_deploy.config import ImagingOptions
 from gcar_export.angiograms import training_pair
-from gcar_export.networks.unet import UNet, UNetConfig
+from gcar_export.networks.mask_unet import MaskUNet, MaskUNetConfig
 
 #: pictures with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -75,7 +75,7 @@ def batch(
 
 
 @torch.no_grad()
-def validate(net: UNet, options: SegmenterOptions) -> float:
+def validate(net: MaskUNet, options: SegmenterOptions) -> float:
     """Mean Dice at 0.5 over held-out generated pictures."""
     net.eval()
     scores = []
@@ -97,7 +97,7 @@ def train(out: Path, options: SegmenterOptions, *, minutes: float | None = None)
     out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
-    net = UNet(UNetConfig()).train()
+    net = MaskUNet(MaskUNetConfig()).train()
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
@@ -126,7 +126,7 @@ def train(out: Path, options: SegmenterOptions, *, minutes: float | None = None)
     _checkpoint(out, net, optimiser, step, options, losses, validate(net, options))
 
 
-def _resume(out: Path, net: UNet, optimiser: torch.optim.Optimizer) -> int:
+def _resume(out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer) -> int:
     path = out / "checkpoint.safetensors"
     if not path.exists():
         return 0
@@ -151,7 +151,7 @@ def _checkpoint(out, net, optimiser, step, options, losses, dice) -> None:
     os.replace(out / "checkpoint.tmp", out / "checkpoint.safetensors")
     manifest = {
         "schema": "gcar-training/1",
-        "network": "unet",
+        "network": "mask-unet",
         "config": dataclasses.asdict(net.config),
         "options": dataclasses.asdict(options),
         "data": "generated angiograms only: gcar_export.angiograms, picture step * batch + k",

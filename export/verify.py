@@ -37,6 +37,12 @@ def verify_model(path: Path, scenes: int) -> str:
         score = 2 * (chosen & truth).sum() / max(int(chosen.sum() + truth.sum()), 1)
         dice.setdefault(scene.kind, []).append(float(score))
     lines = [f"{path.name}: SHA-256 {predictor.model.sha256[:16]}..., as its spec says"]
+    worst = predictor.check_golden()
+    lines.append(
+        "  no golden case beside it"
+        if worst is None
+        else f"  golden case: largest difference {worst:.1e}"
+    )
     lines += [
         f"  {kind}: Dice at 0.5 on the hull {np.mean(v):.3f} ({len(v)} scenes)"
         for kind, v in sorted(dice.items())

@@ -54,6 +54,25 @@ class DicomOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelLimits:
+    """What a model file may be before ONNX Runtime sees it."""
+
+    max_bytes: int = 64 * 2**20
+    #: of the spec beside it, and of the golden input and output
+    max_spec_bytes: int = 64 * 2**10
+    max_golden_bytes: int = 8 * 2**20
+    max_nodes: int = 20_000
+    #: fields of the file in all (a node has some ten)
+    max_fields: int = 1_000_000
+    #: weights and constants in all
+    max_elements: int = 2**25
+    max_opset: int = 30
+    #: largest relative and absolute difference from the golden output
+    golden_rtol: float = 1e-3
+    golden_atol: float = 1e-4
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ImagingOptions:
     """From a picture to vessel mask, skeleton and path length. Millimetres at the isocentre."""
 
@@ -130,7 +149,7 @@ class PoseOptions:
     angle_sigma_deg: float = 0.7
     #: first search along the direction that two views see best, mm
     search_mm: float = 12.0
-    step_mm: float = 0.5
+    step_mm: float = 1.0
     #: smoothing of the mass profiles, mm at the isocentre
     coarse_mm: float = 1.5
     fine_mm: float = 0.5

@@ -245,7 +245,7 @@ def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
         return None
     if path is None:
         raise ModelError("no segmentation network is installed with this version; use classic")
-    model = read_model(path, SEGMENTER_INPUT)
+    model = read_model(path, wanted=SEGMENTER_INPUT)
     return Segmenter(model.data, model.name, threads=threads)
 
 

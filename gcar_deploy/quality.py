@@ -19,7 +19,7 @@ from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import match_rate
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.tree.foreshortening import foreshortening
+from gcar_deploy.tree.lumen import foreshortening
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Mask, Scalars
 
@@ -316,8 +316,16 @@ def view_quality(
         overlap=2.0 * int((lumen & view.mask).sum()) / total if total else None,
         coverage_2px=strict,
         match_rate=None if partner is None else _match_rate(view, partner),
-        foreshortening=foreshortening(tree, view.carm),
+        foreshortening=_hidden(tree, view.carm),
     )
+
+
+def _hidden(tree: Tree, carm: CArm) -> float | None:
+    """Share of the whole tree's length that a view hides; None without a tree."""
+    total = tree.length_mm
+    if not total > 0:
+        return None
+    return sum(foreshortening(b, carm) * b.length_mm for b in tree.branches) / total
 
 
 def _match_rate(view: VesselImage, partner: VesselImage) -> float | None:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy import quality
-from gcar_deploy.advice import advise
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -21,7 +20,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.net import Segmenter
-from gcar_deploy.imaging.resample import sampled
+from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
 from gcar_deploy.predict.center_predictor import CenterPredictor
@@ -94,10 +93,10 @@ def reconstruct(
         views = [_posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
         lattice = cubic_lattice(grid, cell_mm(grid, options))
-        seen = [sampled(view, float(lattice.spacing_mm[0])) for view in views]
-        hull = visual_hull([(v.carm, v.path_mm) for v in seen], lattice, options.candidates)
+        seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
+        hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
-        encoded = encode(hull, [(v.carm, v.path_mm, v.calibrated) for v in seen])
+        encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
     with watch.stage("centers"):
         if predictor is None:
             centers = thin_hull(hull, encoded, options.candidates)
@@ -125,7 +124,6 @@ def reconstruct(
         lumen = [_lumen(tree, view, options) for view in views]
         worst = max(p.after for p in poses)
         judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
-        further = advise(tree, [view.carm for view in views])
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=tuple(views), poses=poses,
@@ -138,7 +136,7 @@ def reconstruct(
         losses=tuple(refined.losses), predictor=centers.source, refiner=options.refine.refiner,
         model=None if predictor is None
         else {"name": predictor.model.name, "sha256": predictor.model.sha256},
-        notes=(), options=options, advice=further,
+        notes=(), options=options,
     )  # fmt: skip
 
 
@@ -170,15 +168,12 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
         fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
-    small = [sampled(view, options.predict.min_cell_mm) for view in views]
+    small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
     marks = landmark_pixels(options.landmarks, [view.carm for view in views])
-    for k, (view, coarse) in enumerate(zip(views, small, strict=True)):
-        scale = np.array([coarse.carm.columns, coarse.carm.rows]) / (
-            view.carm.columns,
-            view.carm.rows,
-        )
+    for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
+        scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
         marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
-    return estimate_poses([(view.carm, view.path_mm) for view in small], pose, marks)
+    return estimate_poses(small, pose, marks)
 
 
 def _posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -77,11 +76,11 @@ def enhance(
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
     from gcar_deploy.imaging.extract import extract_vessels
-    from gcar_deploy.imaging.pictures import vessel_pictures, write_folder
+    from gcar_deploy.imaging.pictures import png_files
     from gcar_deploy.imaging.read import read_picture
+    from gcar_deploy.output.folder import check_target, write_folder
 
-    if out_dir.exists() and not force:
-        raise UsageError(f"{out_dir} exists; choose another folder or add --force")
+    check_target(out_dir, force=force, inputs=(picture,))
     if kind == "path_length" and mm_per_count is None:
         raise UsageError("--kind path_length needs --mm-per-count")
     options = ImagingOptions()
@@ -92,14 +91,14 @@ def enhance(
         click.echo("\n".join(f"gcar: {note}" for note in run.notes), err=True)
     else:
         pixels, valid = read_picture(picture, options.limits), None
-    angiogram = Angiogram.without_geometry(picture.stem, pixels, intensity, pixel_mm)
+    angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
     angiogram = dataclasses.replace(angiogram, valid=valid)
-    pictures: dict[str, Any] = {}
+    pictures: dict[str, bytes] = {}
     for who in ("classic", "net") if segmenter == "both" else (segmenter,):
         chosen = dataclasses.replace(options, segmenter=who)
         found = extract_vessels(angiogram, chosen, load_segmenter(who))
         prefix = "net_" if (segmenter, who) == ("both", "net") else ""
-        pictures |= {prefix + name: p for name, p in vessel_pictures(found).items()}
+        pictures |= {prefix + name: p for name, p in png_files(found).items()}
     write_folder(out_dir, pictures, force=force)
     length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
     click.echo(

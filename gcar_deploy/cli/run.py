@@ -40,6 +40,10 @@ from gcar_deploy.cli.hints import given_masks, hint_options, hinted
 @hint_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
+@click.option("--glb", is_flag=True, help="Write surface.glb as well.")
+@click.option(
+    "--dicom-stl", is_flag=True, help="Write surface.dcm (DICOM Encapsulated STL) as well."
+)
 @output_options
 def run(
     views: tuple[Path, ...],
@@ -55,6 +59,8 @@ def run(
     sod: float | None,
     strict: bool,
     force: bool,
+    glb: bool,
+    dicom_stl: bool,
     verbose: bool,
     quiet: bool,
     as_json: bool,
@@ -79,7 +85,10 @@ def run(
 
     check_target(out_dir, force=force, inputs=(*views, *([geom] if geom else [])))
     from gcar_deploy.engine import Engine
+    from gcar_deploy.output.bundle import check_extras
 
+    extras = [name for name, wanted in (("glb", glb), ("dicom-stl", dicom_stl)) if wanted]
+    check_extras(extras)
     options = run_options(predictor, refiner)
     options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
     options = hinted(options, hints)
@@ -93,7 +102,7 @@ def run(
     if strict and result.status != "ok":
         with refusals_as_json(as_json):
             raise RefusedError(f"degraded, and --strict was given: {result.quality.sentence}")
-    result.save(out_dir, force=force)
+    result.save(out_dir, force=force, extras=extras)
     if as_json:
         click.echo(json.dumps({"out": str(out_dir), **result.summary()}, allow_nan=False))
     else:
@@ -111,6 +120,4 @@ def summary_lines(result: Any, out_dir: Path) -> list[str]:
     for view in result.quality.views:
         coverage = "-" if view.coverage is None else f"{view.coverage:.0%}"
         lines.append(f"view {view.view_id} ({view.name}): {coverage} of the vessels explained")
-    if result.advice is not None:
-        lines.append(result.advice.sentence)
     return lines

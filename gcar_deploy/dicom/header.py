@@ -19,7 +19,7 @@ from typing import Any
 
 from gcar_deploy.config import DicomLimits
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
-from gcar_deploy.imaging.read import read_bytes
+from gcar_deploy.files import read_bounded
 
 CLASSIC = "1.2.840.10008.5.1.4.1.1.12.1"
 ENHANCED = "1.2.840.10008.5.1.4.1.1.12.1.1"
@@ -172,7 +172,7 @@ def read_header(path: str | Path, limits: DicomLimits | None = None) -> Header:
     path = Path(path)
     _need_pydicom()
     try:
-        data = read_bytes(path, limits.max_bytes)
+        data = read_bounded(path, limits.max_bytes)
         return _header(path.name, data, limits)
     except ValueError as error:
         raise ImageError(f"{path.name}: {error}") from None

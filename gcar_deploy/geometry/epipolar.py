@@ -103,8 +103,13 @@ def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scala
         raise GeometryError("the views face each other exactly: no plane through the isocentre")
     e1 = towards / distance
     e2 = np.cross(base, e1)
-    rays = carm.rays(pixels)
-    return np.arctan2(rays @ e2, rays @ e1)
+    # A pixel's ray is M^-1 (col, row, 1) but for its length, which the angle does not ask for.
+    across, ahead = np.linalg.solve(carm.world2pixel[:, :3].T, np.stack([e2, e1], axis=1)).T
+    pixels = np.asarray(pixels, dtype=np.float64)
+    return np.arctan2(
+        pixels @ across[:2] + across[2],
+        pixels @ ahead[:2] + ahead[2],
+    )
 
 
 def plane_normal(first: CArm, second: CArm) -> Array:

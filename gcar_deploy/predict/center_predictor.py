@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 
-from gcar_deploy.errors import ModelError, NumericalError
+from gcar_deploy.errors import CancelledError, ModelError, NumericalError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict.candidates import Candidates
 from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
+from gcar_deploy.predict.golden import check_golden
 from gcar_deploy.predict.model_spec import ModelFile
+from gcar_deploy.types import Array
 
 
 class CenterPredictor:
@@ -43,7 +46,38 @@ class CenterPredictor:
             except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
                 reason = _first_line(error)
                 raise ModelError(f"model {model.name} does not load: {reason}") from None
+            _check_inputs(model, session)
         self._session = session
+        if model.golden is not None:
+            self.check_golden()
+
+    def check_golden(self) -> float | None:
+        """Run the model's golden case again; return the largest difference, None without one.
+
+        Raises
+        ------
+        ModelError
+            It answers differently from the day it was made.
+        """
+        if self.model.golden is None:
+            return None
+        return check_golden(self.model.name, self.model.golden, self._run, self.model.limits)
+
+    def answers(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
+        """Run the graph on named inputs; return its outputs by name."""
+        names = [node.name for node in self._session.get_outputs()]
+        return dict(zip(names, self._run(names, inputs), strict=True))
+
+    def _run(
+        self, outputs: Sequence[str] | None, feed: Mapping[str, Array], run_options: Any = None
+    ) -> list[Array]:
+        try:
+            found: list[Array] = self._session.run(outputs, dict(feed), run_options)
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+            if getattr(run_options, "terminate", False):
+                raise CancelledError("cancelled while the model ran") from None
+            raise ModelError(f"model {self.model.name} fails: {_first_line(error)}") from None
+        return found
 
     def predict(
         self, candidates: Candidates, encoded: Encoded, run_options: Any = None
@@ -60,9 +94,14 @@ class CenterPredictor:
         -------
         CenterPoints
             All n points with confidence, radius and the offset to the expected centreline.
+
+        Raises
+        ------
+        ModelError, NumericalError
+            The model cannot run on these inputs; it returned values that are not finite.
         """
         feed = dict(zip(input_names(), flat_inputs(encoded), strict=True))
-        out = self._session.run(None, feed, run_options)[0]
+        out = self._run(None, feed, run_options)[0]
         if out.shape != (len(candidates), 5) or not np.isfinite(out).all():
             raise NumericalError(f"model {self.model.name} returned values that are not finite")
         h = candidates.spacing_mm
@@ -74,6 +113,12 @@ class CenterPredictor:
             source="multi",
             offset_mm=out[:, 1:4].astype(np.float64) * h,
         )
+
+
+def _check_inputs(model: ModelFile, session: Any) -> None:
+    found = [node.name for node in session.get_inputs()]
+    if sorted(found) != sorted(input_names()) or not session.get_outputs():
+        raise ModelError(f"model {model.name} has other inputs than this version gives")
 
 
 def _first_line(error: Exception) -> str:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.errors import ModelError
+from gcar_deploy.config import ModelLimits
+from gcar_deploy.errors import GeometryError, ModelError
+from gcar_deploy.files import read_bounded
+from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES
+from gcar_deploy.predict.golden import Golden, read_golden
+from gcar_deploy.predict.onnx_guard import check_onnx
 
 SCHEMA = "gcar-model/1"
-MAX_MODEL_BYTES = 64 * 2**20
 #: name of the model that ``gcar run`` uses unless told otherwise
 DEFAULT_MODEL = "gcp-multi"
 #: name of the network that finds vessels in raw pictures
@@ -31,12 +34,16 @@ class ModelFile:
     spec : dict, the content of the ``.json`` beside the ``.onnx``
     sha256 : str of the ONNX file
     data : bytes of the ONNX file
+    golden : Golden or None, a small case with its answer, where there is one beside the model
+    limits : ModelLimits it was read with
     """
 
     name: str
     spec: dict[str, Any]
     sha256: str
     data: bytes = dataclasses.field(repr=False)
+    golden: Golden | None = dataclasses.field(default=None, repr=False)
+    limits: ModelLimits = dataclasses.field(default_factory=ModelLimits, repr=False)
 
 
 def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
@@ -45,32 +52,27 @@ def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
     return path if path.is_file() else None
 
 
-def read_model(path: Path, wanted: Mapping[str, Any] | None = None) -> ModelFile:
-    """Read and verify an ONNX file and the spec beside it.
+def read_model(
+    path: Path, limits: ModelLimits | None = None, wanted: Mapping[str, Any] | None = None
+) -> ModelFile:
+    """Read and verify an ONNX file and the spec beside it; nothing of the model is run.
 
     Parameters
     ----------
-    path : of the ONNX file
+    path : of the ``.onnx``; its ``.json`` and, where there is one, its ``.golden.npz`` lie beside
+    limits : ModelLimits, optional
     wanted : what its spec must say of ``inputs``; by default those of the centre predictor
 
     Raises
     ------
     ModelError
-        A file is missing, too large, not what its spec says, or made for other inputs.
+        A file is missing, too large, not what its spec says, made for other inputs, or holds
+        what a model of this project does not need (see ``onnx_guard``).
     """
+    limits = limits or ModelLimits()
     spec_path = path.with_suffix(".json")
-    for p in (path, spec_path):
-        if not p.is_file():
-            raise ModelError(f"model file {p.name} is missing")
-        if p.stat().st_size > MAX_MODEL_BYTES:
-            raise ModelError(f"model file {p.name} is larger than {MAX_MODEL_BYTES >> 20} MiB")
-    try:
-        spec = json.loads(spec_path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
-        raise ModelError(f"model spec {spec_path.name} is not JSON") from None
-    if not isinstance(spec, dict) or spec.get("schema") != SCHEMA:
-        raise ModelError(f"model spec {spec_path.name} is not of schema {SCHEMA}")
-    data = path.read_bytes()
+    data = _read("model file", path, limits.max_bytes)
+    spec = _spec(spec_path, limits)
     digest = hashlib.sha256(data).hexdigest()
     if digest != spec.get("sha256"):
         raise ModelError(
@@ -81,8 +83,37 @@ def read_model(path: Path, wanted: Mapping[str, Any] | None = None) -> ModelFile
     inputs = spec.get("inputs", {})
     for key, value in wanted.items():
         if not isinstance(inputs, dict) or inputs.get(key) != value:
+            found = inputs.get(key) if isinstance(inputs, dict) else inputs
             raise ModelError(
-                f"model {path.name} wants inputs.{key} = {dict(inputs or {}).get(key)!r}, "
-                f"this version gives {value}"
+                f"model {path.name} wants inputs.{key} = {found!r}, this version gives {value}"
             )
-    return ModelFile(name=str(spec.get("name", path.stem)), spec=spec, sha256=digest, data=data)
+    try:
+        check_onnx(data, limits)
+    except ValueError as error:
+        raise ModelError(f"model file {path.name} {error}") from None
+    return ModelFile(
+        name=str(spec.get("name", path.stem)),
+        spec=spec,
+        sha256=digest,
+        data=data,
+        golden=read_golden(path, digest, limits),
+        limits=limits,
+    )
+
+
+def _read(what: str, path: Path, max_bytes: int) -> bytes:
+    try:
+        return read_bounded(path, max_bytes)
+    except ValueError as error:
+        raise ModelError(f"{what} {path.name}: {error}") from None
+
+
+def _spec(path: Path, limits: ModelLimits) -> dict[str, Any]:
+    data = _read("model file", path, limits.max_spec_bytes)
+    try:
+        spec = read_json(data.decode("utf-8"))
+    except (UnicodeDecodeError, GeometryError):
+        raise ModelError(f"model spec {path.name} is not JSON") from None
+    if not isinstance(spec, dict) or spec.get("schema") != SCHEMA:
+        raise ModelError(f"model spec {path.name} is not of schema {SCHEMA}")
+    return spec

@@ -21,6 +21,9 @@ from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, 
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.types import Array, Image, Pixels
 
+#: relative change of the objective or of the pose below which its fit ends
+TOLERANCE = 1e-4
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pose:
@@ -130,6 +133,8 @@ def _estimate(
             args=(fixed, moving, prior, sigma, options, marks),
             diff_step=1e-3,
             x_scale=prior,
+            ftol=TOLERANCE,
+            xtol=TOLERANCE,
             max_nfev=options.max_evaluations,
         )
         start = solution.x

@@ -88,7 +88,7 @@ def test_out_of_bounds(tmp_path, changes, match):
 
 def test_limits_on_bytes_and_on_all_pixels(tmp_path):
     data = as_bytes(classic())
-    refused(tmp_path, data, "MiB", DicomLimits(max_bytes=1000))
+    refused(tmp_path, data, "KiB that are read", DicomLimits(max_bytes=1000))
     refused(tmp_path, data, "million pixels", DicomLimits(max_pixels=100))
 
 

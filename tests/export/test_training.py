@@ -11,7 +11,14 @@ from gcar_export.dataset import training_scene
 from gcar_export.export_onnx import export_sparse, load_checkpoint, parity
 from gcar_export.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.tiny_model import TINY, write_tiny_checkpoint
-from gcar_export.train import PRESETS, TrainOptions, inputs, learning_rate, scene_loss, train
+from gcar_export.train_multi import (
+    PRESETS,
+    TrainOptions,
+    inputs,
+    learning_rate,
+    scene_loss,
+    train,
+)
 
 
 @pytest.fixture(scope="module")

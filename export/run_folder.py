@@ -1,0 +1,204 @@
+"""The folder of a training run, shared by every network.
+
+``checkpoint.safetensors`` (weights, optimiser state, step), ``manifest.json`` (what was trained,
+on what, with what), ``log.csv`` (one row per kind of scene and validation) and ``curve.png``.
+Each file is replaced whole, so an interruption at any moment leaves a folder to go on from.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+
+from gcar_deploy.errors import UsageError
+
+SCHEMA = "gcar-training/1"
+#: keys of the manifest that a resumed run must share with the run it goes on from
+FIXED = ("network", "config", "seed", "labels")
+
+
+class RunFolder:
+    """One training run on disk.
+
+    Parameters
+    ----------
+    path : folder, made if there is none
+    manifest : what is trained: ``network``, ``config``, ``seed``, ``labels`` (file name to
+        SHA-256) and anything else worth keeping, as JSON knows it
+
+    Raises
+    ------
+    UsageError
+        The folder holds a run of another network, size, seed or set of labels.
+    """
+
+    def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
+        self.path = path
+        self.manifest = {"schema": SCHEMA, **manifest}
+        self._check_same()
+        path.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the weights are."""
+        return self.path / "checkpoint.safetensors"
+
+    def _check_same(self) -> None:
+        file = self.path / "manifest.json"
+        if not file.is_file():
+            return
+        try:
+            before = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError:
+            raise UsageError(f"{file} is not JSON; give another --out") from None
+        now = json.loads(json.dumps(self.manifest))
+        for key in FIXED:
+            if before.get(key) != now.get(key):
+                raise UsageError(
+                    f"{self.path} holds a run with {_shown(key, before.get(key))}, this one has "
+                    f"{_shown(key, now.get(key))}; give another --out, or the same {key}"
+                )
+
+    def resume(self, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> int:
+        """Load weights and optimiser state if there are any; return the step reached."""
+        if not self.checkpoint.is_file():
+            return 0
+        data = load_file(self.checkpoint)
+        load_weights(net, data)
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for n, (name, _) in enumerate(net.named_parameters()):
+            prefix = f"opt.{name}."
+            own = {k[len(prefix) :]: v for k, v in data.items() if k.startswith(prefix)}
+            if own:
+                state[n] = own
+        groups = optimiser.state_dict()["param_groups"]
+        optimiser.load_state_dict({"state": state, "param_groups": groups})
+        return int(data["step"])
+
+    def save(
+        self,
+        net: torch.nn.Module,
+        optimiser: torch.optim.Optimizer,
+        step: int,
+        extra: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write checkpoint and manifest; ``extra`` entries stay in later manifests."""
+        data = {f"net.{k}": _kept(v) for k, v in net.state_dict().items()}
+        for name, p in net.named_parameters():
+            for key, value in optimiser.state.get(p, {}).items():
+                data[f"opt.{name}.{key}"] = _kept(value)
+        data["step"] = torch.tensor(step)
+        partial = self.path / "checkpoint.tmp"
+        save_file(data, partial)
+        self.manifest.update(extra or {})
+        self.manifest["step"] = step
+        self.manifest["versions"] = {
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        }
+        text = json.dumps(self.manifest, indent=1) + "\n"
+        (self.path / "manifest.tmp").write_text(text, encoding="utf-8")
+        os.replace(partial, self.checkpoint)
+        os.replace(self.path / "manifest.tmp", self.path / "manifest.json")
+
+    def log(self, step: int, loss: float, scores: Mapping[str, Mapping[str, float]]) -> None:
+        """Add one validation (kind of scene -> measure -> value) to log.csv and redraw the curve.
+
+        Rows of this step and later ones, left by a run that was cut off, are replaced.
+        """
+        names = list(next(iter(scores.values())))
+        header = ["step", "loss", "kind", *names]
+        file = self.path / "log.csv"
+        rows = [r for r in read_log(file) if int(r["step"]) < step]
+        partial = file.with_suffix(".tmp")
+        with partial.open("w", newline="", encoding="utf-8") as f:
+            writer = csv.DictWriter(f, header, extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(rows)
+            for kind, score in scores.items():
+                shown = {k: f"{v:.4f}" for k, v in score.items()}
+                writer.writerow({"step": step, "loss": f"{loss:.4f}", "kind": kind, **shown})
+        os.replace(partial, file)
+        draw_curve(read_log(file), self.path / "curve.png")
+
+
+class ProgressLine:
+    """One line on stderr every few steps: step, mean loss, rate, time left."""
+
+    def __init__(self, first: int, steps: int, per_step: int, what: str, every: int = 25) -> None:
+        self.first, self.steps, self.per_step, self.what = first, steps, per_step, what
+        self.every = every
+        self.began = time.monotonic()
+
+    def show(self, step: int, losses: Sequence[float]) -> None:
+        """Print after ``step`` if it is its turn."""
+        if step % self.every and step != self.steps:
+            return
+        rate = (step - self.first) / max(time.monotonic() - self.began, 1e-9)
+        left = (self.steps - step) / max(rate, 1e-9) / 60
+        click.echo(
+            f"step {step}/{self.steps}  loss {np.mean(losses[-100:]):.4f}  "
+            f"{rate * self.per_step:.2f} {self.what}/s  {left:.0f} min left",
+            err=True,
+        )
+
+
+def load_weights(net: torch.nn.Module, data: Mapping[str, torch.Tensor]) -> None:
+    """Put the ``net.`` entries of a checkpoint into a network."""
+    net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
+
+
+def read_log(file: Path) -> list[dict[str, str]]:
+    """Rows of a log.csv; none where there is no file."""
+    if not file.is_file():
+        return []
+    with file.open(newline="", encoding="utf-8") as f:
+        return list(csv.DictReader(f))
+
+
+def draw_curve(rows: Sequence[Mapping[str, str]], file: Path) -> None:
+    """Draw loss and every measure over the steps, one panel each, one line per kind."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not rows:
+        return
+    names = [name for name in rows[0] if name not in ("step", "kind")]
+    figure = Figure(figsize=(3.2 * len(names), 2.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    for k, name in enumerate(names):
+        panel = figure.add_subplot(1, len(names), k + 1)
+        for kind in sorted({r["kind"] for r in rows}) if name != "loss" else [rows[0]["kind"]]:
+            own = [r for r in rows if r["kind"] == kind]
+            steps = [int(r["step"]) for r in own]
+            panel.plot(steps, [float(r[name]) for r in own], label=kind, linewidth=1.2)
+        panel.set_title(name, fontsize=9)
+        panel.set_xlabel("step", fontsize=8)
+        panel.tick_params(labelsize=7)
+        if name != "loss":
+            panel.legend(fontsize=6)
+    partial = file.with_name("curve.tmp.png")
+    figure.savefig(partial, dpi=110)
+    os.replace(partial, file)
+
+
+def _kept(value: torch.Tensor) -> torch.Tensor:
+    return value.detach().cpu().clone().contiguous()
+
+
+def _shown(key: str, value: Any) -> str:
+    if key == "labels":
+        return "no labels" if not value else f"{len(value)} label volumes ({', '.join(value)})"
+    return f"{key} = {value!r}"
