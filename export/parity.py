@@ -16,6 +16,7 @@ from gcar_deploy.predict.model_spec import read_model
 from gcar_deploy.types import Array
 from gcar_export.dataset import training_scene
 from gcar_export.export_onnx import DeployedSparse, deployed, export_model, finish, graph_inputs
+from gcar_export.golden import write_golden
 from gcar_export.networks.unet import UNetConfig
 from gcar_export.single_dataset import training_pictures
 from gcar_export.task_check import task_measure, torch_predictor
@@ -150,6 +151,7 @@ def export_checked(checkpoint: Path, out: Path, inputs: int = 60, task_scenes: i
         spec = read_model(partial).spec
         os.replace(partial, out)
         finish(out, {**spec, "name": out.stem})
+        write_golden(out, force=True)
     finally:
         for path in (partial, partial.with_suffix(".json")):
             path.unlink(missing_ok=True)

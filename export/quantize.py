@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.predict.center_map import golden_inputs, single_input_names
 from gcar_deploy.predict.encoding import flat_inputs, input_names
+from gcar_deploy.predict.golden import golden_path
 from gcar_deploy.predict.model_spec import ModelFile, read_model
 from gcar_deploy.types import Array
 from gcar_export.dataset import training_scene
-from gcar_export.export_onnx import finish, golden
+from gcar_export.export_onnx import finish
+from gcar_export.golden import write_golden
 from gcar_export.networks.unet import UNetConfig
 from gcar_export.single_dataset import training_pictures
 from gcar_export.task_check import task_measure
@@ -44,7 +45,7 @@ def _feeds(model: ModelFile, count: int) -> list[dict[str, Array]]:
             dict(zip(input_names(), flat_inputs(training_scene(SEED, i).encoded), strict=True))
             for i in range(count)
         ]
-    names = single_input_names(model.inputs["pose"])
+    names = ["picture", "axes"][: 1 + model.inputs["pose"]]
     config = UNetConfig(pixels=model.inputs["pixels"], alpha=model.inputs["alpha"], width=(1,))
     return [
         dict(zip(names, (p.picture.network_input(), p.picture.axes_input()), strict=False))
@@ -79,24 +80,9 @@ def quantize(path: Path, out: Path, calibration: int = 16) -> ModelFile:
             logging.getLogger().setLevel(quiet)
     spec: dict[str, Any] = json.loads(json.dumps(model.spec))
     spec |= {"name": out.stem, "precision": f"int8, calibrated on {calibration} generated scenes"}
-    spec.pop("golden", None)
     finish(out, spec)
-    found = read_model(out)
-    if found.kind == "single":
-        finish(out, spec | {"golden": golden(_golden_answer(found))})
-        found = read_model(out)
-    return found
-
-
-def _golden_answer(model: ModelFile) -> Array:
-    import onnxruntime as ort
-
-    pose = model.inputs["pose"]
-    session = ort.InferenceSession(model.data, providers=["CPUExecutionProvider"])
-    arrays = golden_inputs(model.inputs["pixels"], pose)
-    feed = dict(zip(single_input_names(pose), arrays, strict=True))
-    answer: Array = session.run(None, feed)[0][0]
-    return answer
+    write_golden(out, force=True)
+    return read_model(out)
 
 
 def quantize_checked(path: Path, scenes: int = 12, calibration: int = 16) -> str:
@@ -123,7 +109,7 @@ def quantize_checked(path: Path, scenes: int = 12, calibration: int = 16) -> str
         if not np.isfinite(lost) or lost > MOST_LOST:
             raise ModelError(f"int8 refused: {figures}; at most {MOST_LOST:.0%} may be lost")
     except BaseException:
-        for file in (out, out.with_suffix(".json")):
+        for file in (out, out.with_suffix(".json"), golden_path(out)):
             file.unlink(missing_ok=True)
         raise
     return f"{out}: int8 accepted, {figures}"

@@ -6,6 +6,7 @@ encoding, merging and decision.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,8 @@ class _TorchSession:
 
 def torch_predictor(checkpoint: Path, model: Path) -> Predictor:
     """Return the runtime's predictor with torch in place of ONNX Runtime."""
-    return open_predictor(read_model(model), session=_TorchSession(deployed(checkpoint)))
+    file = dataclasses.replace(read_model(model), golden=None)
+    return open_predictor(file, session=_TorchSession(deployed(checkpoint)))
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,8 +1,8 @@
 """Make the test models: one of each kind with a few hundred weights, from a seed.
 
 ``python -m gcar_export.tiny_model tests/data`` writes ``tiny.onnx`` and ``tiny-single.onnx`` with
-their specs, through the same export as real checkpoints, so tests exercise the true ONNX path in
-milliseconds.
+their specs and golden cases, through the same export as real checkpoints, so tests exercise the
+true ONNX path in milliseconds.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 from gcar_export.export_onnx import export_model
+from gcar_export.golden import write_golden
 from gcar_export.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.networks.unet import UNetConfig, UNetPredictor
 
@@ -51,6 +52,7 @@ def main(out: Path) -> None:
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = write_tiny_checkpoint(Path(folder), network=network)
             spec = export_model(checkpoint, out / name)
+        write_golden(out / name, force=True)
         click.echo(f"{out / name}: {spec['bytes']} bytes, {spec['parameters']} parameters")
 
 

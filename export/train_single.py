@@ -35,16 +35,16 @@ class SingleOptions:
     """Optimiser settings; the rate warms up, stays, then falls linearly to zero."""
 
     seed: int = 1
-    steps: int = 1_200
-    decay_steps: int = 700
+    steps: int = 1_600
+    decay_steps: int = 800
     trees: int = 4
     warmup_steps: int = 100
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
-    clip: float = 1.0
+    clip: float = 10.0
     #: see ``losses.chamfer_weight``; the paper's 20,000 scaled to the length of the run
     chamfer_schedule: str = "clamp"
-    chamfer_start: int = 700
+    chamfer_start: int = 1_000
     #: clDice on a cube of so many voxels, of so many of a step's pictures
     cldice_voxels: int = 32
     cldice_pictures: int = 1
@@ -151,7 +151,7 @@ def batch_loss(
         if depth is None:
             left_out["depth"] += 1
         else:
-            total = total + losses.GAMMA_DEPTH * depth / n
+            total = total + losses.GAMMA_DEPTH * losses.DEPTH_SCALE * depth / n
         if gamma1 > 0:
             distance = losses.chamfer(batch.centers(out, k), batch.centerline[k])
             if distance is None:

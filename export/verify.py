@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.model_spec import read_model
 from gcar_export.task_check import scores
 
@@ -25,6 +26,12 @@ def verify_model(path: Path, scenes: int) -> str:
     for kind, score in scores(model, scenes):
         dice.setdefault(kind, []).append(score)
     lines = card(model)
+    worst = open_predictor(model, threads=1).check_golden()
+    lines.append(
+        "no golden case beside it"
+        if worst is None
+        else f"golden case: largest difference {worst:.1e}"
+    )
     lines.append("through the runtime's own predictor, on generated scenes:")
     lines += [
         f"  {kind}: Dice at 0.5 on the hull {np.mean(v):.3f} ({len(v)} scenes)"

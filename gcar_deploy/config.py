@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TypeAlias
+
+#: (col, row) of one point in each view, None where it is not seen
+Landmark: TypeAlias = "tuple[tuple[float, float] | None, ...]"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,10 +20,69 @@ class PictureLimits:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class DicomLimits:
+    """What a DICOM run may be before any of its pixels is decoded."""
+
+    max_bytes: int = 512 * 2**20
+    #: pixels; each side of a frame
+    min_side: int = 16
+    max_side: int = 4096
+    max_frames: int = 2000
+    #: of all frames together
+    max_pixels: int = 2**30
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DicomOptions:
+    """From a DICOM run to one picture with its geometry."""
+
+    limits: DicomLimits = dataclasses.field(default_factory=DicomLimits)
+    #: frame of each run, counted from 1, None to choose; one entry holds for all runs
+    frames: tuple[int | None, ...] = (None,)
+    #: for files that do not say it: pixel spacing at the detector, source to isocentre, mm
+    pixel_spacing_mm: float | None = None
+    sod_mm: float | None = None
+    #: frames filled to this share of the best are compared by their stillness
+    filled_share: float = 0.9
+    #: a frame named by the file but filled less than this share of the best is worth a word
+    least_filled_share: float = 0.5
+    #: tilt of the detector against the beam: said above the first, refused above the second
+    good_tilt_deg: float = 0.1
+    max_tilt_deg: float = 1.0
+    #: share by which SDD / SOD may differ from the file's own magnification factor
+    magnification_share: float = 0.02
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelLimits:
+    """What a model file may be before ONNX Runtime sees it."""
+
+    max_bytes: int = 64 * 2**20
+    #: of the spec beside it, and of the golden input and output
+    max_spec_bytes: int = 64 * 2**10
+    max_golden_bytes: int = 8 * 2**20
+    max_nodes: int = 20_000
+    #: fields of the file in all (a node has some ten)
+    max_fields: int = 1_000_000
+    #: weights and constants in all
+    max_elements: int = 2**25
+    max_opset: int = 30
+    #: largest relative and absolute difference from the golden output
+    golden_rtol: float = 1e-3
+    golden_atol: float = 1e-4
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ImagingOptions:
     """From a picture to vessel mask, skeleton and path length. Millimetres at the isocentre."""
 
     limits: PictureLimits = dataclasses.field(default_factory=PictureLimits)
+    #: who finds vessels in grey values: ``classic``, ``net``, or ``auto`` (the network is asked
+    #: where the classical method finds none)
+    segmenter: str = "classic"
+    #: hysteresis on the network's probability
+    net_low: float = 0.4
+    net_high: float = 0.7
     #: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's
     #: edge p. A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns
     #: in the sampling of the picture itself.
@@ -86,7 +149,7 @@ class PoseOptions:
     angle_sigma_deg: float = 0.7
     #: first search along the direction that two views see best, mm
     search_mm: float = 12.0
-    step_mm: float = 0.5
+    step_mm: float = 1.0
     #: smoothing of the mass profiles, mm at the isocentre
     coarse_mm: float = 1.5
     fine_mm: float = 0.5
@@ -94,6 +157,8 @@ class PoseOptions:
     profile_noise: float = 0.05
     #: directions further apart than this are not compared: see ``estimate_poses``
     most_apart_deg: float = 150.0
+    #: how well a person marks the same point in two views, mm at the isocentre
+    landmark_sigma_mm: float = 0.5
     #: a correction must lower the disagreement to this share of what it was
     min_gain: float = 0.85
     max_evaluations: int = 40
@@ -307,6 +372,9 @@ class QualityOptions:
     #: lattice cell is not an error
     near_px: float = 2.0
     near_mm: float = 1.0
+    #: a larger estimated correction between the runs is no small matter of breath or table
+    good_shift_mm: float = 5.0
+    good_turn_deg: float = 1.5
     #: less tree than this is not a coronary tree
     min_length_mm: float = 20.0
 
@@ -315,6 +383,7 @@ class QualityOptions:
 class RunOptions:
     """Everything ``reconstruct`` needs to know beside pictures and geometry."""
 
+    dicom: DicomOptions = dataclasses.field(default_factory=DicomOptions)
     imaging: ImagingOptions = dataclasses.field(default_factory=ImagingOptions)
     pose: PoseOptions = dataclasses.field(default_factory=PoseOptions)
     candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)
@@ -323,3 +392,5 @@ class RunOptions:
     tree: TreeOptions = dataclasses.field(default_factory=TreeOptions)
     refine: RefineOptions = dataclasses.field(default_factory=RefineOptions)
     quality: QualityOptions = dataclasses.field(default_factory=QualityOptions)
+    #: points marked in the pictures, which hold the views to each other
+    landmarks: tuple[Landmark, ...] = ()

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,14 +14,24 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.dicom.header import is_dicom
+from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.geometry.scene import Scene, load_scene, match_picture, parse_scene
+from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.center_predictor import Predictor, open_predictor
-from gcar_deploy.predict.model_spec import SHIPPED, read_model, shipped_model_path
+from gcar_deploy.predict.model_spec import (
+    SEGMENTER_MODEL,
+    SHIPPED,
+    read_model,
+    shipped_model_path,
+)
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
 
@@ -30,6 +41,7 @@ _log = logging.getLogger(__name__)
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
 #: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
 Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
+SEGMENTERS = ("classic", "net", "auto")
 PREDICTORS = ("auto", "multi", "single", "none")
 _DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 
@@ -67,6 +79,7 @@ class Engine:
         self._notes: tuple[str, ...] = ()
         if self._predictor is None and self.options.predict.predictor != "none":
             self._notes = (_missing(self.options.predict.predictor),)
+        self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
 
     @property
     def model(self) -> Mapping[str, str] | None:
@@ -90,8 +103,9 @@ class Engine:
     def reconstruct(
         self,
         views: Sequence[Picture],
-        geometry: Geometry,
+        geometry: Geometry | None = None,
         *,
+        masks: Mapping[int, str | Path | np.ndarray] | None = None,
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
         cancel: Callable[[], bool] | None = None,
@@ -101,10 +115,14 @@ class Engine:
         Parameters
         ----------
         views : 2 or more pictures, in the order of the geometry's views
-        geometry : where they were taken from
+        geometry : where they were taken from; None where DICOM headers say it
+        masks : number of the view, from 1 -> vessel mask (picture of its size), which wins over
+            what would be found in the pixels
         on_progress : called with (stage, share of the work done) from the calling thread
-        deadline_s : seconds after which the refinement ends with what it has (``degraded``)
-        cancel : callable, for instance ``threading.Event().is_set``
+        deadline_s : seconds that the call may take: the refinement ends early enough with what
+            it has (``degraded``); CancelledError if there is nothing to refine by then
+        cancel : callable, for instance ``threading.Event().is_set``; also asked from another
+            thread while the model runs; ends within one step of the refinement
 
         Raises
         ------
@@ -112,21 +130,26 @@ class Engine:
         """
         if deadline_s is not None and not deadline_s > 0:
             raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
+        started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
+        angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
+        notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
         result = reconstruct(
             angiograms,
             grid,
             self.options,
             predictor=self._predictor,
+            segmenter=self._segmenter,
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,
+            used_s=time.perf_counter() - started,
         )
         return dataclasses.replace(result, notes=(*notes, *self._notes, *result.notes))
 
 
 def prepare(
-    views: Sequence[Picture], geometry: Geometry, options: RunOptions
+    views: Sequence[Picture], geometry: Geometry | None, options: RunOptions
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pair pictures with their views.
 
@@ -145,6 +168,8 @@ def prepare(
     """
     if len(views) < 2:
         raise UsageError(f"{len(views)} picture given; two or more are needed")
+    if geometry is None:
+        return _from_headers(views, options)
     given = [view for view in views if isinstance(view, Angiogram)]
     if isinstance(geometry, Grid):
         if len(given) != len(views):
@@ -157,20 +182,22 @@ def prepare(
         )
     notes = list(scene.warnings)
     angiograms = []
+    frames = _frames_for(views, options)
     for picture, view in zip(views, scene.views, strict=True):
         if isinstance(picture, Angiogram):
             angiograms.append(picture)
+            continue
+        if isinstance(picture, (str, Path)) and is_dicom(picture):
+            run = read_run(picture, options.dicom, frames.pop(0))
+            carm = _matched(view, run.pixels.shape, notes)
+            angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
+            notes += run.notes
             continue
         if isinstance(picture, np.ndarray):
             pixels, depth, sha256 = _from_array(view.id, picture, options.imaging.limits)
         else:
             pixels, depth, sha256 = read_picture(picture, options.imaging.limits)
-        try:
-            carm, note = match_picture(view.carm, *pixels.shape)
-        except GeometryError as error:
-            raise GeometryError(f"view {view.id}: {error}") from None
-        if note:
-            notes.append(f"view {view.id}: {note}")
+        carm = _matched(view, pixels.shape, notes)
         angiograms.append(
             Angiogram(
                 view_id=view.id,
@@ -182,6 +209,91 @@ def prepare(
             )
         )
     return angiograms, scene.volume_grid(), notes
+
+
+def with_masks(
+    angiograms: Sequence[Angiogram],
+    masks: Mapping[int, str | Path | np.ndarray],
+    limits: PictureLimits,
+) -> list[Angiogram]:
+    """Give pictures the user's vessel masks.
+
+    Raises
+    ------
+    UsageError
+        There is no view of that number.
+    ImageError
+        A mask cannot be read, has another size than its picture, or no vessel.
+    """
+    out = list(angiograms)
+    for number, given in masks.items():
+        if not 1 <= number <= len(out):
+            raise UsageError(f"mask {number}: there are views 1 .. {len(out)}")
+        array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
+        shape = out[number - 1].pixels.shape
+        if array.shape != shape:
+            raise ImageError(
+                f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
+            )
+        mask = array > 0.5 * float(array.max())
+        if not mask.any() or mask.mean() > 0.9:
+            raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
+        out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)
+    return out
+
+
+def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
+    """Load the network that finds vessels where ``wanted`` needs it.
+
+    Raises
+    ------
+    UsageError
+        ``wanted`` is unknown.
+    ModelError
+        ``net`` is wanted and the network is missing or altered.
+    """
+    if wanted not in SEGMENTERS:
+        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(SEGMENTERS)}")
+    path = shipped_model_path(SEGMENTER_MODEL)
+    if wanted == "classic" or (path is None and wanted == "auto"):
+        return None
+    if path is None:
+        raise ModelError("no segmentation network is installed with this version; use classic")
+    model = read_model(path, wanted=SEGMENTER_INPUT)
+    return Segmenter(model.data, model.name, threads=threads)
+
+
+def _from_headers(
+    views: Sequence[Picture], options: RunOptions
+) -> tuple[list[Angiogram], Grid, list[str]]:
+    """Pictures whose own headers tell the geometry: DICOM XA alone."""
+    paths = [view for view in views if isinstance(view, (str, Path))]
+    for path in paths:
+        if not is_dicom(path):
+            raise UsageError(
+                f"{Path(path).name} is no DICOM file: its geometry is needed (--geom geom.json)"
+            )
+    if len(paths) != len(views):
+        raise UsageError("pictures in memory tell no geometry: give a scene")
+    angiograms, scene, notes = read_views(paths, options.dicom)
+    return angiograms, scene.volume_grid(), notes
+
+
+def _frames_for(views: Sequence[Picture], options: RunOptions) -> list[int | None]:
+    """Frame of each DICOM file among the pictures, in their order."""
+    runs = sum(isinstance(view, (str, Path)) and is_dicom(view) for view in views)
+    return list(wanted_frames(options.dicom, runs)) if runs else []
+
+
+def _matched(view: View, shape: tuple[int, ...], notes: list[str]) -> CArm:
+    """Fit a view to the size of its picture; what was rescaled is added to ``notes``."""
+    try:
+        carm, note = match_picture(view.carm, shape[0], shape[1])
+    except GeometryError as error:
+        raise GeometryError(f"view {view.id}: {error}") from None
+    if note:
+        notes.append(f"view {view.id}: {note}")
+    return carm
 
 
 def _from_array(

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import RunOptions
-from gcar_deploy.engine import prepare
+from gcar_deploy.engine import load_segmenter, prepare
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import silent_errors
+from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.quality import check_consistency, check_views
@@ -58,7 +59,7 @@ class Inspection:
 
 
 def inspect_files(
-    pictures: Sequence[str | Path], geom: str | Path, options: RunOptions | None = None
+    pictures: Sequence[str | Path], geom: str | Path | None, options: RunOptions | None = None
 ) -> Inspection:
     """Read and judge; errors end the inspection and stand in it, nothing is raised."""
     options = options or RunOptions()
@@ -91,9 +92,9 @@ def inspect_files(
             )
         found.silent += silent_errors(carms)
         found.warnings += check_views(angiograms, options.quality)
-        views = []
+        views, segmenter = [], load_segmenter(options.imaging.segmenter)
         for entry, angiogram in zip(found.views, angiograms, strict=True):
-            view = extract_vessels(angiogram, options.imaging)
+            view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())
             views.append(view)
         found.warnings += _consistency(found, views, options)
@@ -122,3 +123,38 @@ def _consistency(found: Inspection, views: Sequence[VesselImage], options: RunOp
                 pair["after_shift"] = pose.after
     after, partners = [p.after for p in poses], [p.partner for p in poses]
     return check_consistency(views, after, options.quality, partners)
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Say what a geometry holds, as a JSON-able dict: views, pairs, volume, warnings, silence."""
+    carms = [view.carm for view in scene.views]
+    grid = scene.volume_grid()
+    return {
+        "schema": "gcar-scene-description/1",
+        "views": [
+            {
+                "id": view.id,
+                "name": view.carm.clinical_name(),
+                "sod_mm": view.carm.sod_mm,
+                "sdd_mm": view.carm.sdd_mm,
+                "rows": view.carm.rows,
+                "columns": view.carm.columns,
+                "pixel_spacing_mm": list(view.carm.pixel_spacing_mm),
+                "pixel_at_isocenter_mm": view.carm.pixel_at_isocenter_mm,
+                "kind": view.intensity.kind,
+            }
+            for view in scene.views
+        ],
+        "pairs": [
+            {"first": a.id, "second": b.id, "separation_deg": separation_deg(a.carm, b.carm)}
+            for a, b in itertools.combinations(scene.views, 2)
+        ],
+        "volume": {
+            "center_mm": list(grid.center_mm),
+            "size_mm": list(grid.size_mm),
+            "shape": list(grid.shape),
+            "given": scene.grid is not None,
+        },
+        "warnings": list(scene.warnings),
+        "silent_errors": list(silent_errors(carms)),
+    }

@@ -13,26 +13,30 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "gcar_deploy"
 #: lower numbers never import higher ones; rooms on one floor keep apart unless listed below
 FLOORS = {
-    "errors": 0, "types": 0, "config": 0, "stopwatch": 1,
+    "errors": 0, "types": 0, "config": 0, "files": 0, "stopwatch": 1,
     "geometry": 1,
     "imaging": 2, "gaussians": 2,
-    "tree": 3,
+    "tree": 3, "dicom": 3,
     "predict": 4, "refine": 4,
-    "quality": 5, "metrics": 5,
+    "quality": 5, "metrics": 5, "alternatives": 5,
     "output": 6,
     "selftest": 6, "data": 6,
     "reconstruct": 7,
     "engine": 8,
-    "inspection": 9,
+    "inspection": 9, "worker": 9, "batch": 9, "benchmark": 9,
     "cli": 10,
 }  # fmt: skip
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load
-HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch")
+HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", "pydicom")
 #: the only files of the runtime that may name these libraries
 WALLED = {
     "torch": {"gaussians/torch_project.py"},
-    "onnxruntime": {"predict/center_predictor.py"},
+    "onnxruntime": {"predict/center_predictor.py", "imaging/net.py"},
     "nibabel": {"output/volume.py"},
+    "pydicom": {"dicom/header.py", "dicom/frames.py", "output/dicom_stl.py"},
+    "distributed": {"batch/pools.py"},
+    "flask": {"worker/http.py"},
+    "waitress": {"worker/http.py"},
 }
 
 

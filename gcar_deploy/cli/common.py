@@ -84,16 +84,23 @@ def output_options(function: _Function) -> _Function:
 
 
 def engine_options(function: _Function) -> _Function:
+    """Add the options that choose how a tree is reconstructed, and for how long."""
+    deadline = click.option(
+        "--deadline",
+        type=click.FloatRange(min=0, min_open=True),
+        default=None,
+        metavar="SECONDS",
+        help="End the refinement with what it has after so long.",
+    )
+    return predictor_options(deadline(function))
+
+
+def predictor_options(function: _Function) -> _Function:
     """Add the options that choose how a tree is reconstructed."""
     for option in (
         click.option(
-            "--predictor",
-            type=click.Choice(["auto", "multi", "single", "none"]),
-            default="auto",
-            show_default=True,
-            help="Who decides depth: a model, or none (the visual hull is thinned).",
+            "--threads", type=click.IntRange(1, 256), default=None, help="At most so many."
         ),
-        click.option("--model", type=click.Path(), default=None, help="ONNX file; spec beside it."),
         click.option(
             "--refiner",
             type=click.Choice(["tube", "paper", "none"]),
@@ -101,19 +108,80 @@ def engine_options(function: _Function) -> _Function:
             show_default=True,
             help="How the tree is fitted to the pictures.",
         ),
+        click.option("--model", type=click.Path(), default=None, help="ONNX file; spec beside it."),
         click.option(
-            "--deadline",
-            type=click.FloatRange(min=0, min_open=True),
-            default=None,
-            metavar="SECONDS",
-            help="End the refinement with what it has after so long.",
-        ),
-        click.option(
-            "--threads", type=click.IntRange(1, 256), default=None, help="At most so many."
+            "--predictor",
+            type=click.Choice(["auto", "multi", "single", "none"]),
+            default="auto",
+            show_default=True,
+            help="Who decides depth: a model, or none (the visual hull is thinned).",
         ),
     ):
         function = option(function)
     return function
+
+
+def dicom_options(function: _Function) -> _Function:
+    """Add what a DICOM file may leave open; arguments ``frame``, ``spacing``, ``sod``."""
+    for option in (
+        click.option(
+            "--sod",
+            type=click.FloatRange(300, 5000),
+            default=None,
+            metavar="MM",
+            help="DICOM without it: source to isocentre.",
+        ),
+        click.option(
+            "--pixel-spacing",
+            "spacing",
+            type=click.FloatRange(0.02, 10),
+            default=None,
+            metavar="MM",
+            help="DICOM without it: pixel spacing at the detector.",
+        ),
+        click.option(
+            "--frame",
+            default="auto",
+            show_default=True,
+            metavar="N|auto",
+            help="DICOM: frame of the run, from 1; one for all files, or 7,12 for each.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def chosen_dicom(frame: str, spacing: float | None, sod: float | None) -> Any:
+    """Return DicomOptions; a wrong ``--frame`` is a UsageError."""
+    from gcar_deploy.config import DicomOptions
+    from gcar_deploy.errors import UsageError
+
+    frames: list[int | None] = []
+    for word in frame.split(","):
+        text = word.strip()
+        if text != "auto" and not (text.isascii() and text.isdigit() and len(text) < 7):
+            raise UsageError(f"--frame {frame[:40]!r} must be auto, a number, or one for each file")
+        frames.append(None if text == "auto" else int(text))
+    return DicomOptions(frames=tuple(frames), pixel_spacing_mm=spacing, sod_mm=sod)
+
+
+@contextlib.contextmanager
+def needs_extra(extra: str, *packages: str) -> Iterator[None]:
+    """Turn a missing library of an extra into one line that says what to install.
+
+    Raises
+    ------
+    UsageError
+        One of ``packages`` is not installed.
+    """
+    from gcar_deploy.errors import UsageError
+
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in packages:
+            raise
+        raise UsageError(f"{error.name} is not installed: pip install 'gcar[{extra}]'") from None
 
 
 @contextlib.contextmanager

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import click
+
+from gcar_deploy.cli.common import chosen_dicom
 
 
 @click.command("enhance")
@@ -39,6 +42,14 @@ import click
     default=None,
     help="For --kind path_length: millimetres of vessel per count.",
 )
+@click.option("--frame", default="auto", show_default=True, help="DICOM: frame, from 1.")
+@click.option(
+    "--segmenter",
+    type=click.Choice(["classic", "net", "both"]),
+    default="classic",
+    show_default=True,
+    help="Who finds the vessels; both writes the network's pictures beside the others.",
+)
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
 def enhance(
     picture: Path,
@@ -47,6 +58,8 @@ def enhance(
     polarity: str,
     pixel_mm: float | None,
     mm_per_count: float | None,
+    frame: str,
+    segmenter: str,
     force: bool,
 ) -> None:
     r"""Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
@@ -55,25 +68,38 @@ def enhance(
     Example:
       gcar enhance view1.png --out steps
     """
-    from gcar_deploy.config import ImagingOptions
+    from gcar_deploy.config import DicomOptions, ImagingOptions
+    from gcar_deploy.dicom.header import is_dicom
+    from gcar_deploy.dicom.scene import read_run
+    from gcar_deploy.engine import load_segmenter
     from gcar_deploy.errors import UsageError
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
     from gcar_deploy.imaging.extract import extract_vessels
-    from gcar_deploy.imaging.pictures import vessel_pictures, write_folder
+    from gcar_deploy.imaging.pictures import png_files
     from gcar_deploy.imaging.read import read_picture
+    from gcar_deploy.output.folder import check_target, write_folder
 
-    if out_dir.exists() and not force:
-        raise UsageError(f"{out_dir} exists; choose another folder or add --force")
+    check_target(out_dir, force=force, inputs=(picture,))
     if kind == "path_length" and mm_per_count is None:
         raise UsageError("--kind path_length needs --mm-per-count")
     options = ImagingOptions()
     intensity = Intensity(kind=kind, polarity=polarity, mm_per_count=mm_per_count)
-    angiogram = Angiogram.without_geometry(
-        picture.stem, read_picture(picture, options.limits), intensity, pixel_mm
-    )
-    found = extract_vessels(angiogram, options)
-    write_folder(out_dir, vessel_pictures(found), force=force)
+    if is_dicom(picture):
+        run = read_run(picture, DicomOptions(), chosen_dicom(frame, None, None).frames[0])
+        pixels, valid = (run.pixels, run.header.bits, run.header.sha256), run.valid
+        click.echo("\n".join(f"gcar: {note}" for note in run.notes), err=True)
+    else:
+        pixels, valid = read_picture(picture, options.limits), None
+    angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
+    angiogram = dataclasses.replace(angiogram, valid=valid)
+    pictures: dict[str, bytes] = {}
+    for who in ("classic", "net") if segmenter == "both" else (segmenter,):
+        chosen = dataclasses.replace(options, segmenter=who)
+        found = extract_vessels(angiogram, chosen, load_segmenter(who))
+        prefix = "net_" if (segmenter, who) == ("both", "net") else ""
+        pictures |= {prefix + name: p for name, p in png_files(found).items()}
+    write_folder(out_dir, pictures, force=force)
     length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
     click.echo(
         f"{out_dir}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "

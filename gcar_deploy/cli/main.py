@@ -16,8 +16,12 @@ import click
 VERBS = {
     "run": ("gcar_deploy.cli.run", "Reconstruct a coronary tree from two or more pictures."),
     "validate": ("gcar_deploy.cli.validate", "Check pictures and geometry; reconstruct nothing."),
+    "geometry": ("gcar_deploy.cli.geometry", "Read or show where the views were taken from."),
     "enhance": ("gcar_deploy.cli.enhance", "Show the steps of finding vessels in one picture."),
     "demo": ("gcar_deploy.cli.demo", "Reconstruct the case that comes along."),
+    "batch": ("gcar_deploy.cli.batch", "Reconstruct every case of a table."),
+    "serve": ("gcar_deploy.cli.serve", "Keep a warm engine for host programs."),
+    "bench": ("gcar_deploy.cli.bench", "Measure speed against error."),
     "doctor": ("gcar_deploy.cli.doctor", "Check this installation."),
     "info": ("gcar_deploy.cli.info", "Print what a result folder or a model is."),
 }

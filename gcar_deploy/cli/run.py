@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import click
 
 from gcar_deploy.cli.common import (
     ProgressBar,
+    chosen_dicom,
+    dicom_options,
     engine_options,
     limit_threads,
     output_options,
@@ -17,6 +20,7 @@ from gcar_deploy.cli.common import (
     run_options,
     set_up_logging,
 )
+from gcar_deploy.cli.hints import given_masks, hint_options, hinted
 
 
 @click.command("run")
@@ -24,37 +28,52 @@ from gcar_deploy.cli.common import (
     "views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 [VIEW3 ...]"
 )
 @click.option(
-    "--geom", required=True, type=click.Path(path_type=Path), help="Geometry of the views (JSON)."
+    "--geom",
+    type=click.Path(path_type=Path),
+    help="Geometry of the views (JSON); DICOM has its own.",
 )
 @click.option(
     "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
 )
 @engine_options
+@dicom_options
+@hint_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
+@click.option("--glb", is_flag=True, help="Write surface.glb as well.")
+@click.option(
+    "--dicom-stl", is_flag=True, help="Write surface.dcm (DICOM Encapsulated STL) as well."
+)
 @output_options
 def run(
     views: tuple[Path, ...],
-    geom: Path,
+    geom: Path | None,
     out_dir: Path,
     predictor: str,
     model: str | None,
     refiner: str,
     deadline: float | None,
     threads: int | None,
+    frame: str,
+    spacing: float | None,
+    sod: float | None,
     strict: bool,
     force: bool,
+    glb: bool,
+    dicom_stl: bool,
     verbose: bool,
     quiet: bool,
     as_json: bool,
+    **hints: Any,
 ) -> None:
-    """Reconstruct a coronary tree from two or more pictures (PNG, TIFF, NPY).
+    """Reconstruct a coronary tree from two or more pictures (PNG, TIFF, NPY, DICOM XA).
 
-    Pictures stand in the order of the views in the geometry file.
+    Pictures stand in the order of the views in the geometry file; DICOM runs need none.
 
     \b
     Example:
       gcar run view1.png view2.png --geom geom.json --out result
+      gcar run run1.dcm run2.dcm --out result
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import RefusedError, UsageError
 
@@ -64,18 +83,26 @@ def run(
     limit_threads(threads)
     from gcar_deploy.output.folder import check_target
 
-    check_target(out_dir, force=force, inputs=(*views, geom))
+    check_target(out_dir, force=force, inputs=(*views, *([geom] if geom else [])))
     from gcar_deploy.engine import Engine
+    from gcar_deploy.output.bundle import check_extras
 
-    engine = Engine(model, threads=threads, options=run_options(predictor, refiner))
+    extras = [name for name, wanted in (("glb", glb), ("dicom-stl", dicom_stl)) if wanted]
+    check_extras(extras)
+    options = run_options(predictor, refiner)
+    options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
+    options = hinted(options, hints)
+    engine = Engine(model, threads=threads, options=options)
     with refusals_as_json(as_json), ProgressBar(quiet=quiet) as bar:
-        result = engine.reconstruct(list(views), geom, on_progress=bar, deadline_s=deadline)
+        result = engine.reconstruct(
+            list(views), geom, masks=given_masks(hints), on_progress=bar, deadline_s=deadline
+        )
     for note in () if quiet else result.notes:
         click.echo(f"gcar: {note}", err=True)
     if strict and result.status != "ok":
         with refusals_as_json(as_json):
             raise RefusedError(f"degraded, and --strict was given: {result.quality.sentence}")
-    result.save(out_dir, force=force)
+    result.save(out_dir, force=force, extras=extras)
     if as_json:
         click.echo(json.dumps({"out": str(out_dir), **result.summary()}, allow_nan=False))
     else:

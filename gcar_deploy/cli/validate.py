@@ -7,24 +7,36 @@ from typing import Any
 
 import click
 
+from gcar_deploy.cli.common import chosen_dicom, dicom_options
+
 EXAMPLE = "Example:\n\n  gcar validate view1.png view2.png --geom geom.json"
 
 
 @click.command(epilog=EXAMPLE, short_help="Check pictures and geometry without reconstructing.")
 @click.argument("pictures", nargs=-1, required=True, type=click.Path(dir_okay=False))
-@click.option("--geom", required=True, type=click.Path(dir_okay=False), help="Scene file.")
+@click.option("--geom", type=click.Path(dir_okay=False), help="Scene file; DICOM has its own.")
+@dicom_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def validate(pictures: tuple[str, ...], geom: str, as_json: bool) -> None:
+def validate(
+    pictures: tuple[str, ...],
+    geom: str | None,
+    frame: str,
+    spacing: float | None,
+    sod: float | None,
+    as_json: bool,
+) -> None:
     """Check PICTURES and the scene file without reconstructing.
 
     Says how far apart the views are, how they magnify, how much of the volume each covers,
     whether they can show the same tree, and what ``gcar run`` would refuse and why; ends with
     the exit code that ``gcar run`` would give.
     """
+    from gcar_deploy.config import RunOptions
     from gcar_deploy.errors import GcarError
     from gcar_deploy.inspection import inspect_files
 
-    found = inspect_files(pictures, geom)
+    options = RunOptions(dicom=chosen_dicom(frame, spacing, sod))
+    found = inspect_files(pictures, geom, options)
     click.echo(json.dumps(found.to_dict()) if as_json else "\n".join(_lines(found)))
     if found.error is not None:
         error: GcarError = found.error

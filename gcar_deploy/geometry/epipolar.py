@@ -62,6 +62,24 @@ def triangulate(carms: Sequence[CArm], pixels: Sequence[Pixels]) -> tuple[Points
     return points, np.sqrt(np.mean(squares, axis=0))
 
 
+def ray_gaps(first: CArm, second: CArm, a: Pixels, b: Pixels) -> Scalars:
+    """Signed distance between the rays of the same points in two views.
+
+    Parameters
+    ----------
+    first, second : CArm
+    a, b : (n, 2) (col, row) in the first and the second view
+
+    Returns
+    -------
+    (n,) mm, along the common normal of both rays; 0 where they meet
+    """
+    normal = np.cross(first.rays(a), second.rays(b))
+    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    gaps: Scalars = normal @ (second.source_mm - first.source_mm) / length
+    return gaps
+
+
 def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scalars:
     """Angle of the epipolar plane through each (n, 2) pixel of ``carm``, radians.
 
@@ -85,8 +103,13 @@ def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scala
         raise GeometryError("the views face each other exactly: no plane through the isocentre")
     e1 = towards / distance
     e2 = np.cross(base, e1)
-    rays = carm.rays(pixels)
-    return np.arctan2(rays @ e2, rays @ e1)
+    # A pixel's ray is M^-1 (col, row, 1) but for its length, which the angle does not ask for.
+    across, ahead = np.linalg.solve(carm.world2pixel[:, :3].T, np.stack([e2, e1], axis=1)).T
+    pixels = np.asarray(pixels, dtype=np.float64)
+    return np.arctan2(
+        pixels @ across[:2] + across[2],
+        pixels @ ahead[:2] + ahead[2],
+    )
 
 
 def plane_normal(first: CArm, second: CArm) -> Array:

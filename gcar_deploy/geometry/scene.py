@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import GeometryError
+from gcar_deploy.files import read_bounded
 from gcar_deploy.geometry.carm import CLINICAL_RANGES, CArm
 from gcar_deploy.geometry.fields import (
     MAX_BYTES,
@@ -133,13 +134,11 @@ def load_scene(path: str | Path) -> Scene:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise GeometryError(f"{path.name} is larger than {MAX_BYTES // 1024} KiB")
-        text = path.read_bytes().decode("utf-8")
+        text = read_bounded(path, MAX_BYTES).decode("utf-8")
     except UnicodeDecodeError:
         raise GeometryError(f"{path.name} is not UTF-8 text") from None
-    except OSError as error:
-        raise GeometryError(f"{path.name} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise GeometryError(f"{path.name} cannot be read: {error}") from None
     return parse_scene(text, path.name)
 
 

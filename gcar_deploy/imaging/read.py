@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import os
-import stat
 import tokenize
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import numpy as np
 
 from gcar_deploy.config import PictureLimits
 from gcar_deploy.errors import ImageError
+from gcar_deploy.files import read_bounded
 from gcar_deploy.imaging import png_guard
 from gcar_deploy.types import Array, Image
 
@@ -50,44 +49,13 @@ def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple
     limits = limits or PictureLimits()
     path = Path(path)
     try:
-        data = _read_bytes(path, limits.max_bytes)
+        data = read_bounded(path, limits.max_bytes)
         pixels, depth = _decode(data, path.suffix.lower(), limits)
     except ValueError as error:
         raise ImageError(f"{path.name}: {error}") from None
     sha256 = hashlib.sha256(data).hexdigest()
     _log.debug("read %d bytes, %s, %d bit, sha256 %s", len(data), pixels.shape, depth, sha256)
     return pixels, depth, sha256
-
-
-def _read_bytes(path: Path, max_bytes: int) -> bytes:
-    try:
-        # O_NONBLOCK: a named pipe must be refused, not waited for.
-        handle = os.open(
-            path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        )
-    except FileNotFoundError:
-        raise ValueError("no such file; check the path") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "invalid path"
-        raise ValueError(f"cannot be opened ({reason}); check the path") from None
-    try:
-        # before fdopen, which takes no folders
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise ValueError("is not a regular file; give the picture itself")
-        stream = os.fdopen(handle, "rb")
-    except ValueError:
-        os.close(handle)
-        raise
-    with stream:
-        info = os.fstat(stream.fileno())
-        if info.st_size > max_bytes:
-            raise ValueError(
-                f"has {info.st_size / 2**20:.0f} MiB; at most {max_bytes / 2**20:.0f} MiB are read"
-            )
-        data = stream.read(max_bytes + 1)
-    if not data:
-        raise ValueError("is empty; copy or export it again")
-    return data
 
 
 def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Image, int]:

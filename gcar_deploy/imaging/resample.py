@@ -8,6 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.types import Array, Image
@@ -71,3 +72,12 @@ def sampled(view: VesselImage, pixel_mm: float) -> VesselImage:
         return view
     rows, columns = (max(round(n * scale), 1) for n in view.mask.shape)
     return resized(view, rows, columns)
+
+
+def sampled_path(view: VesselImage, pixel_mm: float) -> tuple[CArm, Image]:
+    """Like ``sampled``, but only the C-arm and the path lengths: no mask, no skeleton."""
+    scale = view.carm.pixel_at_isocenter_mm / pixel_mm
+    if scale >= 1:
+        return view.carm, view.path_mm
+    rows, columns = (max(round(n * scale), 1) for n in view.mask.shape)
+    return view.carm.resized(rows, columns), area_average(view.path_mm, rows, columns)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gcar_deploy.errors import UsageError
 from gcar_deploy.output.folder import write_folder
-from gcar_deploy.output.overlay import overlay, png_bytes
+from gcar_deploy.output.glb import glb_bytes
+from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
 from gcar_deploy.output.result import Result
 from gcar_deploy.output.tables import (
@@ -23,32 +26,57 @@ from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 RESULT_NAME = "result.json"
 #: lattice of the lumen surface: finer than a section every 0.8 mm, and still a few megabytes
 SURFACE_EDGE_MM = 0.4
+#: files that are written when asked for
+EXTRAS = {"glb": "surface.glb", "dicom-stl": "surface.dcm"}
 
 
-def render_files(result: Result) -> dict[str, bytes]:
+def render_files(result: Result, extras: Sequence[str] = ()) -> dict[str, bytes]:
     """File name -> content of everything in the folder, ``result.json`` last.
 
     ``result.json`` lists size and SHA-256 of every other file under ``files``.
+
+    Parameters
+    ----------
+    extras : names of ``EXTRAS``
+
+    Raises
+    ------
+    UsageError
+        An extra is unknown, or needs a library that is not installed.
     """
+    check_extras(extras)
+    surface = lumen_surface(result.tree, SURFACE_EDGE_MM)
     makers: dict[str, Callable[[], bytes]] = {
         "volume.nii.gz": lambda: nifti_bytes(result.volume, result.grid),
         "gaussians.npz": lambda: gaussians_npz(result.gaussians),
         "gaussians.ply": lambda: gaussians_ply(result.gaussians),
         "centerline.vtp": lambda: centerline_vtp(result.tree),
         "centerline.csv": lambda: centerline_csv(result.tree),
-        "surface.stl": lambda: stl_bytes(lumen_surface(result.tree, SURFACE_EDGE_MM)),
+        "surface.stl": lambda: stl_bytes(surface),
     }
+    if "glb" in extras:
+        makers[EXTRAS["glb"]] = lambda: glb_bytes(surface)
+    if "dicom-stl" in extras:
+        from gcar_deploy.output.dicom_stl import dicom_stl_bytes
+
+        makers[EXTRAS["dicom-stl"]] = lambda: dicom_stl_bytes(
+            stl_bytes(surface), [angiogram.sha256 for angiogram in result.angiograms]
+        )
     files = {name: make() for name, make in makers.items()}
-    overlays = [
+    pictures = [
         overlay(angiogram.pixels, view, result.tree, judged, result.options.quality)
         for angiogram, view, judged in zip(
             result.angiograms, result.views, result.quality.views, strict=True
         )
     ]
-    for number, picture in enumerate(overlays, start=1):
+    for number, picture in enumerate(pictures, start=1):
         files[f"overlay_view{number}.png"] = png_bytes(picture)
     summary = result.summary()
-    files["report.html"] = report_html(result, summary, overlays).encode("utf-8")
+    backdrops = [
+        backdrop(angiogram.pixels, view, result.tree, result.options.quality)[0]
+        for angiogram, view in zip(result.angiograms, result.views, strict=True)
+    ]
+    files["report.html"] = report_html(result, summary, backdrops).encode("utf-8")
     summary["files"] = {
         name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         for name, data in files.items()
@@ -57,15 +85,27 @@ def render_files(result: Result) -> dict[str, bytes]:
     return files
 
 
-def write_result(result: Result, out_dir: Path, *, force: bool = False) -> Path:
-    """Write the result folder.
+def check_extras(extras: Sequence[str]) -> None:
+    """Find out early whether extra files can be written; see ``render_files``."""
+    unknown = sorted(set(extras) - EXTRAS.keys())
+    if unknown:
+        raise UsageError(f"extra file {unknown[0]!r} is none of {', '.join(EXTRAS)}")
+    if "dicom-stl" in extras and importlib.util.find_spec("pydicom") is None:
+        raise UsageError("pydicom is not installed: pip install 'gcar[dicom]'")
+
+
+def write_result(
+    result: Result, out_dir: Path, *, force: bool = False, extras: Sequence[str] = ()
+) -> Path:
+    """Write the result folder, with the files of ``extras`` (names of ``EXTRAS``) in it.
 
     Raises
     ------
     UsageError
-        The folder exists (without ``force``), is a link or a file, or cannot be made.
+        An extra cannot be written; the folder exists (without ``force``), is a link or a
+        file, or cannot be made.
     GcarError
         The disk refused; nothing is left.
     """
-    write_folder(out_dir, render_files(result), force=force)
+    write_folder(out_dir, render_files(result, extras), force=force)
     return out_dir

@@ -6,13 +6,12 @@ import contextlib
 import ctypes
 import errno
 import os
-import shutil
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.output.scratch import FRESH, OLD, scratch_folder, sweep
 
 _AT_FDCWD = -100
 _RENAME_NOREPLACE = 1
@@ -55,7 +54,7 @@ def write_folder(out_dir: Path, files: Mapping[str, bytes], *, force: bool = Fal
 
     The files are on the disk before the rename. An existing folder (with ``force``) is
     exchanged in one step where the system can, and removed afterwards; whatever happens, one
-    of the two complete folders stands at ``out_dir``.
+    of the two complete folders stands at ``out_dir``. What killed runs left beside it is removed.
 
     Raises
     ------
@@ -66,14 +65,15 @@ def write_folder(out_dir: Path, files: Mapping[str, bytes], *, force: bool = Fal
     """
     check_target(out_dir, force=force)
     try:
-        with _parents(out_dir), _scratch(out_dir) as scratch:
-            fresh = scratch / "new"
+        with _parents(out_dir), scratch_folder(out_dir.absolute().parent) as scratch:
+            fresh = scratch / FRESH
             fresh.mkdir()
             for name, data in files.items():
                 _write(fresh / name, data)
             _sync_folder(fresh)
-            _put(fresh, out_dir, scratch / "old", force=force)
+            _put(fresh, out_dir, scratch / OLD, force=force)
             _sync_folder(out_dir.absolute().parent)
+        sweep(out_dir.absolute().parent)
     except OSError as error:
         raise GcarError(f"{out_dir} cannot be written ({error.strerror or error})") from None
 
@@ -96,16 +96,6 @@ def _parents(out_dir: Path) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 folder.rmdir()
         raise
-
-
-@contextlib.contextmanager
-def _scratch(out_dir: Path) -> Iterator[Path]:
-    """Temporary folder in the same file system; removed also on an interrupt."""
-    scratch = Path(tempfile.mkdtemp(prefix=".gcar-", dir=out_dir.absolute().parent))
-    try:
-        yield scratch
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _write(path: Path, data: bytes) -> None:

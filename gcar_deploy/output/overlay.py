@@ -66,12 +66,7 @@ def overlay(
     -------
     (rows, cols, 3) uint8, blue green red, at least 768 wide
     """
-    rows, columns = pixels.shape
-    zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
-    base = cv2.resize(grey8(pixels), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
-    canvas = cv2.cvtColor((base * _DIM).astype(np.uint8), cv2.COLOR_GRAY2BGR)
-    missing = unexplained(tree, view, options)
-    _mark(canvas, missing, zoom)
+    canvas, zoom = backdrop(pixels, view, tree, options)
     lines = [_line(branch.points_mm, view.carm, zoom) for branch in tree.branches]
     width = max(2, round(canvas.shape[1] / 500))
     # A dark casing under each line keeps every colour readable on bright vessels.
@@ -85,6 +80,21 @@ def overlay(
     _labels(canvas, judged)
     _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom)
     return canvas
+
+
+def backdrop(
+    pixels: Image, view: VesselImage, tree: Tree, options: QualityOptions
+) -> tuple[Array, int]:
+    """Return the dimmed picture with what the tree leaves unexplained in red, and its zoom.
+
+    See ``overlay`` for the arguments; (rows, cols, 3) uint8, enlarged by the whole number zoom.
+    """
+    rows, columns = pixels.shape
+    zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
+    base = cv2.resize(grey8(pixels), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+    canvas = cv2.cvtColor((base * _DIM).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    _mark(canvas, unexplained(tree, view, options), zoom)
+    return canvas, zoom
 
 
 def png_bytes(picture: Array) -> bytes:

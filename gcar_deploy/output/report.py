@@ -12,10 +12,9 @@ from importlib import resources
 from typing import Any
 
 import cv2
-import numpy as np
 
 from gcar_deploy.errors import GcarError
-from gcar_deploy.output.overlay import branch_color
+from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.result import Result
 from gcar_deploy.tree.lumen import foreshortening
 from gcar_deploy.types import Array
@@ -24,19 +23,18 @@ _TEMPLATE = "report_template.html"
 #: tried in turn until the pictures together fit the budget
 _JPEG_QUALITIES = (85, 75, 65, 50, 35)
 _PICTURE_SIDE = 1024
-_PICTURES_BYTES = 240_000
-#: points drawn in 3D, all branches together
-_DRAWN_POINTS = 3000
+_PICTURES_BYTES = 200_000
 
 
-def report_html(result: Result, summary: Mapping[str, Any], overlays: Sequence[Array]) -> str:
+def report_html(result: Result, summary: Mapping[str, Any], pictures: Sequence[Array]) -> str:
     """Render the page.
 
     Parameters
     ----------
     result : Result
     summary : its ``summary()``
-    overlays : (rows, cols, 3) uint8 pictures, blue green red, one per view
+    pictures : (rows, cols, 3) uint8, blue green red, one per view, of any size; the reprojected
+        tree is drawn over them by the page
 
     Returns
     -------
@@ -49,10 +47,13 @@ def report_html(result: Result, summary: Mapping[str, Any], overlays: Sequence[A
         "FINDINGS": _list(_sentences(summary)),
         "FACTS": _facts(summary),
         "FIGURES": "".join(
-            _figure(view, picture, _PICTURES_BYTES // len(overlays))
-            for view, picture in zip(summary["views"], overlays, strict=True)
+            _figure(k, view, picture, _PICTURES_BYTES // len(pictures))
+            for k, (view, picture) in enumerate(zip(summary["views"], pictures, strict=True))
         ),
-        "BUTTONS": "".join(_button(k, view) for k, view in enumerate(summary["views"])),
+        "BUTTONS": "".join(_button(k, view) for k, view in enumerate(summary["views"]))
+        + _further_button(summary),
+        "FURTHER": _further(summary),
+        "ANGLES": _angles(summary),
         "SHORTCOUNT": str(len(summary["views"]) + 1),
         "SHORTHEAD": "".join(
             f"<th>view {html.escape(str(view['id']))}</th>" for view in summary["views"]
@@ -66,7 +67,7 @@ def report_html(result: Result, summary: Mapping[str, Any], overlays: Sequence[A
         "TIMINGS": _rows({k: f"{v:.2f} s" for k, v in summary["seconds"].items()}),
         "PROVENANCE": _rows(_provenance(summary)),
         "USE": html.escape(str(summary["use"])),
-        "DATA": _embedded(_scene(result)),
+        "DATA": _embedded(scene_data(result, summary["best_further_view"])),
     }
     # One pass: a name of a view that looks like a mark is text.
     page = re.sub("__([A-Z]+)__", lambda mark: parts.get(mark[1], mark[0]), template)
@@ -93,30 +94,7 @@ def _embedded(data: Any) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _scene(result: Result) -> dict[str, Any]:
-    """Return what the drawings need: rounded and thinned to what a screen can show."""
-    branches = []
-    stride = max(1, -(-len(result.tree.points()) // _DRAWN_POINTS))
-    for number, branch in enumerate(result.tree.branches):
-        blue, green, red = branch_color(number)
-        keep = np.unique([*range(0, len(branch), stride), len(branch) - 1])
-        sigma = [round(float(s), 2) if np.isfinite(s) else None for s in branch.sigma_mm[keep]]
-        branches.append(
-            {
-                "points": np.round(branch.points_mm[keep], 2).tolist(),
-                "arc": np.round(branch.arc_mm[keep], 2).tolist(),
-                "radius": np.round(branch.radius_mm[keep], 2).tolist(),
-                "sigma": sigma,
-                "color": f"rgb({red},{green},{blue})",
-            }
-        )
-    views = [[view.carm.primary_angle_deg, view.carm.secondary_angle_deg] for view in result.views]
-    lengths = [branch.length_mm for branch in result.tree.branches]
-    longest = int(np.argmax(lengths)) if lengths else -1
-    return {"branches": branches, "views": views, "longest": longest}
-
-
-def _figure(view: Mapping[str, Any], picture: Array, most_bytes: int) -> str:
+def _figure(number: int, view: Mapping[str, Any], picture: Array, most_bytes: int) -> str:
     name = html.escape(f"View {view['id']}: {view['name']}")
     source = base64.b64encode(_jpeg(picture, most_bytes)).decode("ascii")
     details = [
@@ -126,8 +104,10 @@ def _figure(view: Mapping[str, Any], picture: Array, most_bytes: int) -> str:
         f"mean distance {_number(view['distance_mm'], ' mm')}",
     ]
     return (
-        f'<figure><img alt="{name} with the reprojected centreline" '
-        f'src="data:image/jpeg;base64,{source}"><figcaption><b>{name}</b><br>'
+        f'<figure><div class="stage"><img alt="{name}" src="data:image/jpeg;base64,{source}">'
+        f'<canvas class="lines" data-view="{number}" role="img" '
+        f'aria-label="{name}: reprojected centreline"></canvas></div>'
+        f"<figcaption><b>{name}</b><br>"
         f"{'; '.join(details)}</figcaption></figure>"
     )
 
@@ -153,12 +133,44 @@ def _button(number: int, view: Mapping[str, Any]) -> str:
     return f'<button type="button" data-view="{number}">{name}</button>'
 
 
+def _further_button(summary: Mapping[str, Any]) -> str:
+    if summary["best_further_view"] is None:
+        return ""
+    name = html.escape(str(summary["best_further_view"]["name"]))
+    return f'<button type="button" data-view="{len(summary["views"])}">Further: {name}</button>'
+
+
+def _further(summary: Mapping[str, Any]) -> str:
+    view = summary["best_further_view"]
+    if view is None:
+        return "Best further view: not known."
+    return (
+        f"Best further view: <b>{html.escape(str(view['name']))}</b>. It would lower the mean "
+        f"bound of the centreline's error for 1 px of noise from {view['sigma_before_mm']:.2f} to "
+        f"{view['sigma_after_mm']:.2f} mm, and hides {view['foreshortening']:.0%} of the length."
+    )
+
+
+def _angles(summary: Mapping[str, Any]) -> str:
+    """One row a bifurcation: where, and the angle between each two branches."""
+    rows = {}
+    for k, node in enumerate(summary["tree"]["bifurcations"], start=1):
+        rows[f"Bifurcation {k}"] = "; ".join(
+            f"{angle['branches'][0] + 1} and {angle['branches'][1] + 1}: {angle['angle_deg']:.0f}°"
+            for angle in node["angles"]
+        )
+    return _rows(rows) or "<tr><td>none</td></tr>"
+
+
 def _branch(number: int, row: Mapping[str, Any], hidden: Sequence[float]) -> str:
     cells = [
         str(number + 1),
         f"{row['length_mm']:.1f}",
         f"{2 * row['mean_radius_mm']:.2f}",
-        f"{2 * row['min_radius_mm']:.2f}",
+        _number(row["minimal_diameter_mm"]),
+        _number(row["reference_diameter_mm"]),
+        "-" if row["stenosis_percent"] is None else f"{row['stenosis_percent']:.0f} %",
+        "-" if row["lesion_length_mm"] is None else f"{row['lesion_length_mm']:.1f}",
         _number(row["mean_sigma_mm"]),
         *(f"{100 * share:.0f} %" for share in hidden),
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,12 @@ import numpy as np
 from gcar_deploy.config import RunOptions
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
+from gcar_deploy.tree.further_view import best_further_view
+from gcar_deploy.tree.lumen import BranchLumen, bifurcation_angles, branch_lumens
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Volume
 
@@ -26,6 +29,10 @@ RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or tr
 _PACKAGES = (
     "gcar", "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "onnxruntime",
     "nibabel",
+)  # fmt: skip
+_LUMEN = (
+    "/minimal_diameter_mm", "/minimal_at_mm", "/reference_diameter_mm", "/stenosis_percent",
+    "/lesion_length_mm",
 )  # fmt: skip
 
 
@@ -77,6 +84,7 @@ class Result:
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
         reasons: dict[str, str] = {}
+        further = best_further_view(self.tree, [view.carm for view in self.views])
         body = {
             "schema": SCHEMA,
             "status": self.quality.status,
@@ -86,15 +94,23 @@ class Result:
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],
+            "silent_errors": list(silent_errors([view.carm for view in self.views])),
             "tree": {
                 "length_mm": self.tree.length_mm,
-                "branches": [_branch(branch) for branch in self.tree.branches],
+                "branches": [
+                    _branch(branch, lumen)
+                    for branch, lumen in zip(
+                        self.tree.branches, branch_lumens(self.tree), strict=True
+                    )
+                ],
+                "bifurcations": bifurcations(self.tree),
             },
             "volume": {
                 "center_mm": list(self.grid.center_mm),
                 "size_mm": list(self.grid.size_mm),
                 "shape": list(self.grid.shape),
             },
+            "best_further_view": None if further is None else dataclasses.asdict(further),
             "counts": dict(self.counts),
             "losses": list(self.losses),
             "seconds": dict(self.seconds),
@@ -106,6 +122,9 @@ class Result:
             "use": RESEARCH_USE,
         }
         out: dict[str, Any] = plain(body, "", reasons)
+        for path in reasons:
+            if path.startswith("/tree/branches/") and path.endswith(_LUMEN):
+                reasons[path] = "the branch is too short to state a stenosis"
         if self.model is None:
             reasons["/model"] = "made without a model"
         out["reasons"] = reasons
@@ -115,11 +134,17 @@ class Result:
         """``summary`` as strict JSON text."""
         return json.dumps(self.summary(), indent=1, allow_nan=False) + "\n"
 
-    def save(self, out_dir: str | Path, *, force: bool = False) -> Path:
-        """Write the result folder, all or nothing; see ``output.bundle``."""
+    def save(self, out_dir: str | Path, *, force: bool = False, extras: Sequence[str] = ()) -> Path:
+        """Write the result folder, all or nothing; see ``output.bundle``.
+
+        Parameters
+        ----------
+        force : replace an existing folder
+        extras : of ``glb`` (surface.glb) and ``dicom-stl`` (surface.dcm)
+        """
         from gcar_deploy.output.bundle import write_result
 
-        return write_result(self, Path(out_dir), force=force)
+        return write_result(self, Path(out_dir), force=force, extras=extras)
 
     def _view(self, k: int) -> dict[str, Any]:
         angiogram, judged, pose = self.angiograms[k], self.quality.views[k], self.poses[k]
@@ -138,6 +163,13 @@ class Result:
             "support": judged.support,
             "distance_mm": judged.distance_mm,
             "overlap": judged.overlap,
+            "coverage_2px": judged.coverage_2px,
+            "match_rate": judged.match_rate,
+            "foreshortening": judged.foreshortening,
+            "disagreement_before": pose.before,
+            "disagreement_after": pose.after,
+            "landmark_gap_before_mm": pose.landmark_before_mm,
+            "landmark_gap_after_mm": pose.landmark_after_mm,
             "estimated_offset_mm": list(pose.offset_mm),
             "estimated_primary_deg": pose.primary_deg,
             "estimated_secondary_deg": pose.secondary_deg,
@@ -155,7 +187,23 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def _branch(branch: Branch) -> dict[str, Any]:
+def bifurcations(tree: Tree) -> list[dict[str, Any]]:
+    """Nodes where three or more branches meet, with the angle between each two of them.
+
+    Branches are counted from 0, as in ``branches``.
+    """
+    found: dict[int, dict[str, Any]] = {}
+    for angle in bifurcation_angles(tree):
+        place = tree.nodes_mm[angle.node].tolist()
+        node = found.setdefault(
+            angle.node, {"node": angle.node, "position_mm": place, "angles": []}
+        )
+        pair = {"branches": [angle.first, angle.second], "angle_deg": angle.angle_deg}
+        node["angles"].append(pair)
+    return list(found.values())
+
+
+def _branch(branch: Branch, lumen: BranchLumen) -> dict[str, Any]:
     known = branch.sigma_mm[np.isfinite(branch.sigma_mm)]
     return {
         "start": branch.start,
@@ -165,6 +213,11 @@ def _branch(branch: Branch) -> dict[str, Any]:
         "min_radius_mm": float(branch.radius_mm.min()),
         "mean_sigma_mm": float(known.mean()) if len(known) else None,
         "confidence": float(branch.confidence.mean()),
+        "minimal_diameter_mm": lumen.minimal_diameter_mm,
+        "minimal_at_mm": lumen.minimal_at_mm,
+        "reference_diameter_mm": lumen.reference_diameter_mm,
+        "stenosis_percent": lumen.stenosis_percent,
+        "lesion_length_mm": lumen.lesion_length_mm,
     }
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.tree.lumen import branch_lumens
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 
@@ -92,6 +93,10 @@ def centerline_vtp(tree: Tree) -> bytes:
         "StartNode": np.array([branch.start for branch in tree.branches], dtype=np.int64),
         "EndNode": np.array([branch.end for branch in tree.branches], dtype=np.int64),
         "Length": np.array([branch.length_mm for branch in tree.branches], dtype=np.float64),
+        "MinimalDiameter": _of_lumens(tree, "minimal_diameter_mm"),
+        "ReferenceDiameter": _of_lumens(tree, "reference_diameter_mm"),
+        "StenosisPercent": _of_lumens(tree, "stenosis_percent"),
+        "LesionLength": _of_lumens(tree, "lesion_length_mm"),
     }
     count = int(sum(sizes))
     out = [
@@ -142,6 +147,12 @@ def centerline_csv(tree: Tree) -> bytes:
 def _of_points(tree: Tree, name: str) -> Array:
     parts: Sequence[Array] = [getattr(branch, name) for branch in tree.branches]
     return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _of_lumens(tree: Tree, name: str) -> Array:
+    """(branches,) float64 figure of each branch, NaN where it is too short to say."""
+    values = [getattr(lumen, name) for lumen in branch_lumens(tree)]
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
 def _field(value: float) -> str:

@@ -145,24 +145,6 @@ def decode(output: Array, picture: NetPicture, alpha: int) -> ViewCenters:
     )
 
 
-def single_input_names(pose: bool) -> list[str]:
-    """Names of the graph's inputs, in order; the axes only where it is told the pose."""
-    return ["picture", "axes"] if pose else ["picture"]
-
-
-def golden_inputs(pixels: int, pose: bool) -> list[Array]:
-    """Return the fixed input, (1, 1, n, n) and axes, whose answer a model's spec remembers."""
-    axes = np.array([[[0.8, 0.6, 0.0], [0.0, 0.0, -1.0], [0.6, -0.8, 0.0]]], np.float32)
-    return [_golden_picture(pixels), axes] if pose else [_golden_picture(pixels)]
-
-
-def _golden_picture(pixels: int) -> Array:
-    row, col = np.mgrid[:pixels, :pixels] * (2 * np.pi / pixels)
-    # Two crossing bands with dark between: edges, gradients and empty ground.
-    wave = np.maximum(np.sin(3 * row + np.cos(2 * col)) + np.sin(2 * col - row) - 0.8, 0.0)
-    return np.ascontiguousarray(wave[None, None] / 1.2, dtype=np.float32)
-
-
 def blocks(picture: Array, alpha: int) -> Array:
     """(n, n) to (n/alpha, n/alpha, alpha^2): the pixels of each cell."""
     m = len(picture) // alpha

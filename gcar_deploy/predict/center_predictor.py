@@ -1,32 +1,31 @@
-"""The Gaussian centre predictors through ONNX Runtime: the only file that imports it."""
+"""The Gaussian centre predictors through ONNX Runtime: only this file of the room imports it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 import onnxruntime as ort
 
-from gcar_deploy.errors import ModelError, NumericalError
+from gcar_deploy.errors import CancelledError, ModelError, NumericalError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.candidates import Candidates
-from gcar_deploy.predict.center_map import (
-    OUTPUTS,
-    ViewCenters,
-    decode,
-    golden_inputs,
-    net_picture,
-    single_input_names,
-)
+from gcar_deploy.predict.center_map import OUTPUTS, ViewCenters, decode, net_picture
 from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
+from gcar_deploy.predict.golden import check_golden
 from gcar_deploy.predict.model_spec import ModelFile
 from gcar_deploy.types import Array, Image
 
+#: how often a running inference is asked whether it should end, seconds
+WATCH_S = 0.02
 
-class CenterPredictor:
-    """A warm session of the multi-view predictor; safe to share between threads.
+
+class _Warm:
+    """A warm session of one model; safe to share between threads.
 
     Parameters
     ----------
@@ -39,10 +38,63 @@ class CenterPredictor:
         self, model: ModelFile, *, threads: int = 2, session: ort.InferenceSession | None = None
     ) -> None:
         self.model = model
-        self._session = _open(model, threads) if session is None else session
+        if session is None:
+            session = _open(model, threads)
+            self._check_inputs(session)
+        self._session = session
+        if model.golden is not None:
+            self.check_golden()
+
+    def input_names(self) -> list[str]:
+        """Names of the graph's inputs."""
+        raise NotImplementedError
+
+    def _check_inputs(self, session: Any) -> None:
+        found = [node.name for node in session.get_inputs()]
+        if sorted(found) != sorted(self.input_names()) or not session.get_outputs():
+            raise ModelError(f"model {self.model.name} has other inputs than this version gives")
+
+    def check_golden(self) -> float | None:
+        """Run the model's golden case again; return the largest difference, None without one.
+
+        Raises
+        ------
+        ModelError
+            It answers differently from the day it was made.
+        """
+        if self.model.golden is None:
+            return None
+        return check_golden(self.model.name, self.model.golden, self._run, self.model.limits)
+
+    def answers(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
+        """Run the graph on named inputs; return its outputs by name."""
+        names = [node.name for node in self._session.get_outputs()]
+        return dict(zip(names, self._run(names, inputs), strict=True))
+
+    def _run(
+        self, outputs: Sequence[str] | None, feed: Mapping[str, Array], run_options: Any = None
+    ) -> list[Array]:
+        try:
+            found: list[Array] = self._session.run(outputs, dict(feed), run_options)
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+            if getattr(run_options, "terminate", False):
+                raise CancelledError("cancelled while the model ran") from None
+            raise ModelError(f"model {self.model.name} fails: {_first_line(error)}") from None
+        return found
+
+
+class CenterPredictor(_Warm):
+    """The multi-view predictor. Takes what ``_Warm`` takes."""
+
+    def input_names(self) -> list[str]:
+        """Names of the graph's inputs."""
+        return input_names()
 
     def predict(
-        self, candidates: Candidates, encoded: Encoded, run_options: Any = None
+        self,
+        candidates: Candidates,
+        encoded: Encoded,
+        should_stop: Callable[[], bool] | None = None,
     ) -> CenterPoints:
         """Judge every candidate.
 
@@ -50,15 +102,23 @@ class CenterPredictor:
         ----------
         candidates : Candidates (n points)
         encoded : Encoded, from ``encode`` with the same candidates
-        run_options : onnxruntime.RunOptions, to terminate a running call
+        should_stop : asked every ``WATCH_S`` from another thread; True ends a running inference
 
         Returns
         -------
         CenterPoints
             All n points with confidence, radius and the offset to the expected centreline.
+
+        Raises
+        ------
+        ModelError, NumericalError
+            The model cannot run on these inputs; it returned values that are not finite.
+        CancelledError
+            ``should_stop`` said so.
         """
         feed = dict(zip(input_names(), flat_inputs(encoded), strict=True))
-        out = self._session.run(None, feed, run_options)[0]
+        with _watched(should_stop) as run_options:
+            out = self._run(None, feed, run_options)[0]
         if out.shape != (len(candidates), 5) or not np.isfinite(out).all():
             raise NumericalError(f"model {self.model.name} returned values that are not finite")
         h = candidates.spacing_mm
@@ -72,64 +132,50 @@ class CenterPredictor:
         )
 
 
-class SingleViewPredictor:
-    """A warm session of the paper's single-view predictor; safe to share between threads.
+class SingleViewPredictor(_Warm):
+    """The paper's single-view predictor. Takes what ``_Warm`` takes."""
 
-    Takes what ``CenterPredictor`` takes.
-    """
-
-    def __init__(
-        self, model: ModelFile, *, threads: int = 2, session: ort.InferenceSession | None = None
-    ) -> None:
-        self.model = model
-        self.pixels, self.alpha = int(model.inputs["pixels"]), int(model.inputs["alpha"])
-        self._pose = bool(model.inputs["pose"])
-        self._session = _open(model, threads) if session is None else session
-        self._check_golden()
-
-    def _check_golden(self) -> None:
-        """Refuse a library or processor that makes something else of the graph than training."""
-        golden = self.model.spec.get("golden")
-        if not isinstance(golden, dict):
-            return
-        answer = self._answer(golden_inputs(self.pixels, self._pose), None)
-        answer = answer.reshape(OUTPUTS, -1).astype(np.float64)
-        found = {"mean": answer.mean(axis=1), "std": answer.std(axis=1)}
-        for key, value in found.items():
-            if not np.allclose(value, golden.get(key, np.nan), rtol=1e-3, atol=1e-4):
-                raise ModelError(
-                    f"model {self.model.name} does not give its golden output on this machine"
-                )
+    def input_names(self) -> list[str]:
+        """Names of the graph's inputs; the axes only where the model is told the pose."""
+        return ["picture", "axes"] if self.model.inputs["pose"] else ["picture"]
 
     def predict(
-        self, views: Sequence[tuple[CArm, Image]], run_options: Any = None
+        self,
+        views: Sequence[tuple[CArm, Image]],
+        should_stop: Callable[[], bool] | None = None,
     ) -> list[ViewCenters]:
         """Predict centres in every view on its own.
 
         Parameters
         ----------
         views : sequence of (CArm, path_mm), (rows, columns) path length in mm, any size
-        run_options : onnxruntime.RunOptions, to terminate a running call
+        should_stop : as in ``CenterPredictor.predict``
 
         Returns
         -------
         ViewCenters per view, lifted along its true rays
-        """
-        pictures = [net_picture(carm, path, self.pixels) for carm, path in views]
-        # One picture a call: memory does not grow with the number of views.
-        feeds = [[p.network_input(), p.axes_input()][: 1 + self._pose] for p in pictures]
-        answers = [self._answer(feed, run_options) for feed in feeds]
-        return [decode(a, p, self.alpha) for a, p in zip(answers, pictures, strict=True)]
 
-    def _answer(self, arrays: Sequence[Array], run_options: Any) -> Array:
-        """(4, m, m) from (1, 1, n, n) and, for some models, (1, 3, 3)."""
-        feed = dict(zip(single_input_names(self._pose), arrays, strict=True))
-        out = self._session.run(None, feed, run_options)[0]
-        m = self.pixels // self.alpha
-        if out.shape != (1, OUTPUTS, m, m) or not np.isfinite(out).all():
-            raise NumericalError(f"model {self.model.name} returned values that are not finite")
-        answer: Array = out[0]
-        return answer
+        Raises
+        ------
+        ModelError, NumericalError, CancelledError
+            As ``CenterPredictor.predict``.
+        """
+        pixels, alpha = int(self.model.inputs["pixels"]), int(self.model.inputs["alpha"])
+        shape = (1, OUTPUTS, pixels // alpha, pixels // alpha)
+        found = []
+        with _watched(should_stop) as run_options:
+            # One picture a call: memory does not grow with the number of views.
+            for carm, path in views:
+                picture = net_picture(carm, path, pixels)
+                arrays = (picture.network_input(), picture.axes_input())
+                feed = dict(zip(self.input_names(), arrays, strict=False))
+                out = self._run(None, feed, run_options)[0]
+                if out.shape != shape or not np.isfinite(out).all():
+                    raise NumericalError(
+                        f"model {self.model.name} returned values that are not finite"
+                    )
+                found.append(decode(out[0], picture, alpha))
+        return found
 
 
 #: either predictor, as the engine holds it
@@ -153,8 +199,31 @@ def _open(model: ModelFile, threads: int) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(model.data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
-        reason = _first_line(error)
-        raise ModelError(f"model {model.name} does not load: {reason}") from None
+        raise ModelError(f"model {model.name} does not load: {_first_line(error)}") from None
+
+
+@contextlib.contextmanager
+def _watched(should_stop: Callable[[], bool] | None) -> Iterator[Any]:
+    """RunOptions whose run ends soon after ``should_stop`` says so; None without a question."""
+    if should_stop is None:
+        yield None
+        return
+    run_options, over = ort.RunOptions(), threading.Event()
+
+    def watch() -> None:
+        # Inference holds the calling thread for its whole length: only another one can ask.
+        while not over.wait(WATCH_S):
+            if should_stop():
+                run_options.terminate = True
+                return
+
+    watcher = threading.Thread(target=watch, name="gcar-watch", daemon=True)
+    watcher.start()
+    try:
+        yield run_options
+    finally:
+        over.set()
+        watcher.join()
 
 
 def _first_line(error: Exception) -> str:

@@ -19,7 +19,7 @@ from gcar_deploy.refine.tube_fit import fit_tubes
 from gcar_deploy.refine.volume import tube_volume
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Volume
+from gcar_deploy.types import Array, Volume
 
 REFINERS = ("tube", "paper", "none")
 ShouldStop = Callable[[], bool]
@@ -43,6 +43,7 @@ class Refined:
         ``empty`` (nothing to refine).
     contrast : (views,) factor of each picture's path on the model's, 1 where calibrated
     centers : CenterPoints the refinement started from
+    model_mm : per view (rows, cols) path of the fitted tubes, mm; empty where not at hand
     """
 
     refiner: str
@@ -54,6 +55,7 @@ class Refined:
     status: str
     contrast: tuple[float, ...]
     centers: CenterPoints
+    model_mm: tuple[Array, ...] = ()
 
 
 def refine(
@@ -106,6 +108,7 @@ def refine(
         status=status,
         contrast=fit.contrast,
         centers=centers,
+        model_mm=fit.model_mm,
     )
 
 
@@ -126,6 +129,7 @@ def refined_volume(
         refined.centers,
         options.tube.edge_blur_mm,
         options.volume,
+        refined.model_mm,
     )
 
 

@@ -33,6 +33,8 @@ class Target:
     pixel_mm : float, pixel edge at the isocentre
     calibrated : bool
     contrast : float, factor on the model, 1 for calibrated pictures
+    empty_cost : float, sum over pixels of weight log(1 + (path / (c sigma))^2), the robust
+        cost of an empty model
     """
 
     carm: CArm
@@ -43,6 +45,7 @@ class Target:
     pixel_mm: float
     calibrated: bool = True
     contrast: float = 1.0
+    empty_cost: float = 0.0
 
     def with_contrast(self, model: Array) -> Target:
         """Fit the contrast factor to a model picture by least squares (variable projection)."""
@@ -89,12 +92,17 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
         path = cv2.GaussianBlur(path, (0, 0), COARSE_BLUR_PX)
         variance += COARSE_BLUR_PX**2
     share = options.noise_share if view.calibrated else options.noise_share_uncalibrated
+    path = path.astype(np.float64)
+    sigma = options.noise_mm + share * path
+    some = path > 0
+    z = path[some] / (options.robust_sigmas * sigma[some])
     return Target(
         carm=carm,
-        path_mm=path.astype(np.float64),
+        path_mm=path,
         weight=weight.astype(np.float64),
-        sigma_mm=options.noise_mm + share * path.astype(np.float64),
+        sigma_mm=sigma,
         box_px=max(float(np.sqrt(12 * variance)), 0.05),
         pixel_mm=carm.pixel_at_isocenter_mm,
         calibrated=view.calibrated,
+        empty_cost=float((np.log1p(z * z) * weight[some]).sum()),
     )

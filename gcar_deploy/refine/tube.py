@@ -18,13 +18,13 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.refine.targets import Target
 from gcar_deploy.refine.tube_model import Footprint, Tubes, footprint
-from gcar_deploy.refine.tube_prior import Prior
+from gcar_deploy.refine.tube_prior import Prior, columns_of
 from gcar_deploy.types import Array, Scalars
 
 #: bounds of the radius, mm.
@@ -66,8 +66,8 @@ def fit_level(
     steps: int,
     progress: Progress,
     should_stop: Callable[[], bool] | None = None,
-) -> Tubes:
-    """Run up to ``steps`` damped Gauss-Newton steps; returns the best tubes found."""
+) -> tuple[Tubes, list[Footprint]]:
+    """Run up to ``steps`` damped Gauss-Newton steps; returns the best tubes, and their prints."""
     damping = 1e-3
     prints = footprints(tubes, targets)
     targets = rescaled(targets, prints)
@@ -75,7 +75,7 @@ def fit_level(
     progress.losses.append(loss)
     if not np.isfinite(loss):
         progress.failed = True
-        return tubes
+        return tubes, prints
     for _ in range(steps):
         if should_stop is not None and should_stop():
             progress.stopped = True
@@ -99,7 +99,7 @@ def fit_level(
         progress.losses.append(loss)
         if gain < options.tolerance:
             break
-    return tubes
+    return tubes, prints
 
 
 def footprints(
@@ -132,9 +132,14 @@ def objective(
     total = prior.value(unknowns(tubes))
     c2 = options.robust_sigmas**2
     for target, seen in zip(targets, prints, strict=True):
-        model = target.contrast * seen.image(target.path_mm.shape)
-        z2 = ((target.path_mm - model) / target.sigma_mm) ** 2
-        total += float((np.log1p(z2 / c2) * target.weight).sum()) * 0.5 * c2 * target.pixel_mm**2
+        # Pixels without a tube cost what they cost an empty model.
+        pixel = seen.pixel[seen.first]
+        path = target.path_mm.reshape(-1)[pixel]
+        sigma = target.sigma_mm.reshape(-1)[pixel]
+        z2 = ((path - target.contrast * seen.totals()) / sigma) ** 2
+        change = np.log1p(z2 / c2) - np.log1p((path / sigma) ** 2 / c2)
+        cost = target.empty_cost + float((change * target.weight.reshape(-1)[pixel]).sum())
+        total += 0.5 * c2 * cost * target.pixel_mm**2
     return total
 
 
@@ -146,75 +151,82 @@ def normal_equations(
     options: TubeOptions,
 ) -> tuple[sparse.csc_matrix, Scalars]:
     """Hessian (Gauss-Newton, majorised) and gradient over the unknowns."""
-    columns = _columns(tubes)
     count = len(tubes.first)
     size = 3 * len(tubes.positions_mm) + len(tubes.log_radius)
-    blocks = np.zeros((8, 8, count))
-    gradient = prior.gradient(unknowns(tubes))
+    blocks = np.zeros((count, 8, 8))
+    pull = np.zeros((count, 8))
     for target, seen in zip(targets, prints, strict=True):
         if not len(seen.pixel):
             continue
-        # Sorted by segment, the sums over a segment's entries are matrix products.
-        J = _jacobian(tubes, target.carm, seen) * target.contrast
-        residual = target.path_mm - target.contrast * seen.image(target.path_mm.shape)
-        e = residual.reshape(-1)[seen.pixel]
+        e = (target.path_mm.reshape(-1)[seen.pixel[seen.first]] - target.contrast * seen.totals())[
+            seen.group
+        ]
         sigma = target.sigma_mm.reshape(-1)[seen.pixel]
         robust = 1.0 / (1.0 + (e / (options.robust_sigmas * sigma)) ** 2)
         w = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
-        order = np.argsort(seen.segment, kind="stable")
-        segment = seen.segment[order]
-        start = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))
-        which = segment[start]
-        J = J[:, order]
-        pull = np.add.reduceat(J * (w * e)[order], start, axis=1)
-        gradient -= np.bincount(columns[which].T.reshape(-1), pull.reshape(-1), minlength=size)
-        weighted = J * (w * seen.crossings)[order]
-        for a in range(8):
-            blocks[a, a:, which] += np.add.reduceat(weighted[a] * J[a:], start, axis=1).T
-    for a in range(8):
-        blocks[a + 1 :, a] = blocks[a, a + 1 :]
-    rows = np.broadcast_to(columns.T[:, None], blocks.shape).reshape(-1)
-    cols = np.broadcast_to(columns.T[None, :], blocks.shape).reshape(-1)
-    data = sparse.coo_matrix((blocks.reshape(-1), (rows, cols)), shape=(size, size))
-    return (data.tocsc() + prior.hessian).tocsc(), gradient
+        moments = _moments(seen, w * seen.crossings * target.contrast**2, count)
+        pulls = _pulls(seen, w * e * target.contrast, count)
+        M = _to_unknowns(tubes, target.carm)
+        blocks += M @ moments @ np.swapaxes(M, 1, 2)
+        pull += (M @ pulls[:, :, None])[:, :, 0]
+    gradient = prior.gradient(unknowns(tubes))
+    gradient -= np.bincount(columns_of(tubes).reshape(-1), pull.reshape(-1), minlength=size)
+    return prior.added(blocks), gradient
 
 
-def _columns(tubes: Tubes) -> Array:
-    """(s, 8) unknowns of each segment: position a (3), position b (3), log radius a, b."""
-    a, b = tubes.owner[tubes.first], tubes.owner[tubes.second]
-    axis = np.arange(3)
-    offset = 3 * len(tubes.positions_mm)
-    return np.concatenate(
-        [
-            3 * a[:, None] + axis,
-            3 * b[:, None] + axis,
-            (offset + tubes.first)[:, None],
-            (offset + tubes.second)[:, None],
-        ],
-        axis=1,
-    )
+def _basis(seen: Footprint) -> tuple[Scalars, ...]:
+    """Six derivatives of an entry's path: by both ends' pixels (col, row) and log radii."""
+    # The distance shrinks when the axis moves towards the pixel.
+    x = -seen.d_distance * seen.normal[:, 0]
+    y = -seen.d_distance * seen.normal[:, 1]
+    r, t = seen.d_log_radius, seen.t
+    s = 1 - t
+    return x * s, y * s, x * t, y * t, r * s, r * t
 
 
-def _jacobian(tubes: Tubes, carm: CArm, seen: Footprint) -> Array:
-    """(8, e) derivatives of an entry's path by its segment's unknowns."""
-    J = carm.jacobian(tubes.points_mm)
-    i, j = tubes.first[seen.segment], tubes.second[seen.segment]
-    nx, ny = seen.normal[:, 0], seen.normal[:, 1]
-    out = np.empty((8, len(i)))
-    for row, point, share in ((0, i, 1 - seen.t), (3, j, seen.t)):
-        # The distance shrinks when the axis moves towards the pixel.
-        pull = -seen.d_distance * share
-        for k in range(3):
-            out[row + k] = pull * (nx * J[point, 0, k] + ny * J[point, 1, k])
-    out[6] = seen.d_log_radius * (1 - seen.t)
-    out[7] = seen.d_log_radius * seen.t
+def _moments(seen: Footprint, weight: Scalars, count: int) -> Array:
+    """(s, 6, 6) weighted sums of products of the derivatives over each segment's entries."""
+    basis = _basis(seen)
+    out = np.empty((count, 6, 6))
+    for a in range(6):
+        scaled = weight * basis[a]
+        for b in range(a, 6):
+            out[:, a, b] = np.bincount(seen.segment, scaled * basis[b], minlength=count)
+            out[:, b, a] = out[:, a, b]
+    return out
+
+
+def _pulls(seen: Footprint, weight: Scalars, count: int) -> Array:
+    """(s, 6) weighted sums of the derivatives over each segment's entries."""
+    sums = [np.bincount(seen.segment, weight * d, minlength=count) for d in _basis(seen)]
+    return np.stack(sums, axis=1)
+
+
+def _to_unknowns(tubes: Tubes, carm: CArm) -> Array:
+    """(s, 8, 6) from derivatives by pixels and log radii to those by a segment's unknowns."""
+    J = np.swapaxes(carm.jacobian(tubes.points_mm), 1, 2)
+    out = np.zeros((len(tubes.first), 8, 6))
+    out[:, 0:3, 0:2] = J[tubes.first]
+    out[:, 3:6, 2:4] = J[tubes.second]
+    out[:, 6, 4] = out[:, 7, 5] = 1.0
     return out
 
 
 def _solve(hessian: sparse.csc_matrix, gradient: Scalars, damping: float) -> Scalars:
-    damped = hessian + sparse.diags(damping * hessian.diagonal() + 1e-9)
-    step: Scalars = splu(damped.tocsc(), permc_spec="MMD_AT_PLUS_A").solve(-gradient)
+    diagonal = hessian.diagonal()
+    damped = hessian + sparse.diags(damping * diagonal + 1e-9, format="csc")
+    step: Scalars = factorised(damped).solve(-gradient)
     return step
+
+
+def factorised(hessian: sparse.csc_matrix) -> SuperLU:
+    """Factorise a symmetric positive definite matrix; the diagonal is its own best pivot."""
+    return splu(
+        hessian,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 def unknowns(tubes: Tubes) -> Scalars:

@@ -21,12 +21,12 @@ from gcar_deploy.refine.tube import (
     normal_equations,
     rescaled,
 )
-from gcar_deploy.refine.tube_model import Tubes, tubes_of
+from gcar_deploy.refine.tube_model import Footprint, Tubes, tubes_of
 from gcar_deploy.refine.tube_prior import Prior, make_prior
 from gcar_deploy.refine.uncertainty import fit_sigma, geometry_sigma
 from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Scalars
+from gcar_deploy.types import Array, Scalars
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +40,8 @@ class TubeFit:
     scatter_mm : float, estimated scatter of the starting points (0 on a lattice)
     contrast : tuple of float, per view, factor of the picture's path on the model's
     progress : Progress
+    model_mm : per view (rows, cols) path of the tubes at the picture's own pixels; empty where
+        the fit ended before that level
     """
 
     tree: Tree
@@ -47,6 +49,7 @@ class TubeFit:
     scatter_mm: float
     contrast: tuple[float, ...]
     progress: Progress
+    model_mm: tuple[Array, ...] = ()
 
 
 def fit_tubes(
@@ -69,17 +72,18 @@ def fit_tubes(
     settled_centers, scatter = settled(
         usable_points(centers), [(view.carm, view.path_mm) for view in views]
     )
+    if should_stop is not None:
+        # Whoever cancelled raises here; a deadline is heeded by the first step.
+        should_stop()
     tree = build_tree(settled_centers, tree_options)
-    contrast = (1.0,) * len(views)
-    if tree.branches:
-        tree, contrast = _fitted(tree, views, _Run(options, progress, should_stop))
-    return TubeFit(
+    fit = TubeFit(
         tree=tree,
         centers=settled_centers,
         scatter_mm=scatter,
-        contrast=contrast,
+        contrast=(1.0,) * len(views),
         progress=progress,
     )
+    return _fitted(fit, views, _Run(options, progress, should_stop)) if tree.branches else fit
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,39 +94,64 @@ class _Run:
     progress: Progress
     should_stop: Callable[[], bool] | None
 
-    def fit(self, tree: Tree, targets: list[Target], steps: int) -> tuple[Tree, Tubes, Prior]:
+    def fit(self, tree: Tree, targets: list[Target], steps: int) -> _State:
         """Fit from where the tree is now."""
         tubes, prior = _start(tree, self.options)
+        prints: list[Footprint] = []
         if tree.branches:
-            tubes = fit_level(
+            tubes, prints = fit_level(
                 tubes, targets, prior, self.options, steps, self.progress, self.should_stop
             )
-        return tree_of(tubes, tree), tubes, prior
+        return _State(tree_of(tubes, tree), tubes, prior, prints)
 
 
-def _fitted(tree: Tree, views: Sequence[VesselImage], run: _Run) -> tuple[Tree, tuple[float, ...]]:
-    options = run.options
+@dataclasses.dataclass(frozen=True, eq=False)
+class _State:
+    """A tree, its tubes, the prior round its start, and where the tubes fall in each view."""
+
+    tree: Tree
+    tubes: Tubes
+    prior: Prior
+    prints: list[Footprint]
+
+
+def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
+    options, progress = run.options, run.progress
     targets: list[Target] = []
-    start_radius = tree.radii()
-    tubes, prior = _start(tree, options)
+    start_radius = start.tree.radii()
+    now = _State(start.tree, *_start(start.tree, options), [])
     for number, (level, steps) in enumerate(zip(options.levels_mm, options.steps, strict=True)):
-        if run.progress.stopped or run.progress.failed:
+        if number and (progress.stopped or progress.failed):
             break
         targets = _contrasts(make_targets(views, level, options), targets)
-        tubes = fit_level(tubes, targets, prior, options, steps, run.progress, run.should_stop)
-        tree = tree_of(tubes, tree)
+        tubes, prints = fit_level(
+            now.tubes, targets, now.prior, options, steps, progress, run.should_stop
+        )
+        now = _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
         if number or len(options.levels_mm) == 1:
             continue
         if options.min_share > 0 and len(targets) > 1:
-            tree, tubes, prior = _chosen(tree, tubes, start_radius, targets, run)
-        if tree.branches:
-            tree = _supported(tree, tubes, targets, options)
-            tree, tubes, prior = run.fit(tree, targets, steps // 2)
-        if not tree.branches:
-            return tree, tuple(target.contrast for target in targets)
-    targets = rescaled(targets, footprints(tubes, targets))
-    tree = with_sigma(tree, tubes, targets, prior, options)
-    return tree, tuple(target.contrast for target in targets)
+            now = _chosen(now, start_radius, targets, run)
+        if now.tree.branches:
+            now = run.fit(_supported(now, targets, options), targets, steps // 2)
+        if not now.tree.branches:
+            break
+    contrast = tuple(target.contrast for target in targets)
+    if not now.tree.branches:
+        return dataclasses.replace(start, tree=now.tree, contrast=contrast)
+    targets = rescaled(targets, now.prints)
+    own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
+    return dataclasses.replace(
+        start,
+        tree=with_sigma(now, targets, options),
+        contrast=tuple(target.contrast for target in targets),
+        model_mm=tuple(
+            seen.image(target.path_mm.shape)
+            for target, seen in zip(targets, now.prints, strict=True)
+        )
+        if own and not options.levels_mm[-1]
+        else (),
+    )
 
 
 def _start(tree: Tree, options: TubeOptions) -> tuple[Tubes, Prior]:
@@ -140,27 +169,26 @@ def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
     ]
 
 
-def _chosen(
-    tree: Tree, tubes: Tubes, start_radius: Scalars, targets: list[Target], run: _Run
-) -> tuple[Tree, Tubes, Prior]:
+def _chosen(now: _State, start_radius: Scalars, targets: list[Target], run: _Run) -> _State:
     """Drop ghosts, fit the rest, and take back what every view then misses."""
-    options = run.options
-    targets = rescaled(targets, footprints(tubes, targets))
-    pieces = weigh_pieces(tree, tubes, start_radius, targets, options)
+    options, tree = run.options, now.tree
+    targets = rescaled(targets, now.prints)
+    pieces = weigh_pieces(tree, now.tubes, start_radius, targets, options)
     steps = options.steps[0] // 2
-    kept, tubes, prior = run.fit(kept_tree(tree, pieces, options), targets, steps)
-    left = unexplained(targets, footprints(tubes, targets))
+    kept = run.fit(kept_tree(tree, pieces, options), targets, steps)
+    prints = kept.prints or footprints(kept.tubes, targets)
+    left = unexplained(targets, prints)
     back = reinstated(tree, pieces, start_radius, targets, left, options)
     if np.array_equal(back.share, pieces.share):
-        return kept, tubes, prior
+        return kept
     return run.fit(kept_tree(tree, back, options), targets, steps)
 
 
-def _supported(tree: Tree, tubes: Tubes, targets: list[Target], options: TubeOptions) -> Tree:
+def _supported(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
     """Cut what the pictures do not show, then grow along what the tree does not explain."""
-    prints = footprints(tubes, targets)
-    targets = rescaled(targets, prints)
-    tree = supported_tree(tree, tubes, seen_share(tubes, targets, prints), options)
+    targets = rescaled(targets, now.prints)
+    share = seen_share(now.tubes, targets, now.prints)
+    tree = supported_tree(now.tree, now.tubes, share, options)
     if not tree.branches or options.max_growth_mm <= 0:
         return tree
     left = unexplained(targets, footprints(tubes_of(tree), targets))
@@ -178,12 +206,10 @@ def tree_of(tubes: Tubes, tree: Tree) -> Tree:
     return dataclasses.replace(tree, nodes_mm=nodes, branches=tuple(branches))
 
 
-def with_sigma(
-    tree: Tree, tubes: Tubes, targets: list[Target], prior: Prior, options: TubeOptions
-) -> Tree:
+def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
     """Return the tree with sigma per point: fit and geometry prior, in quadrature."""
-    prints = footprints(tubes, targets)
-    hessian, _ = normal_equations(tubes, targets, prints, prior, options)
+    tree, tubes = now.tree, now.tubes
+    hessian, _ = normal_equations(tubes, targets, now.prints, now.prior, options)
     tangents = np.zeros_like(tubes.positions_mm)
     tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
     own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]

@@ -9,7 +9,7 @@ from scipy import sparse
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.refine.tube_model import Tubes
-from gcar_deploy.types import Scalars
+from gcar_deploy.types import Array, Scalars
 
 #: confidence below which a starting point still holds a little.
 LEAST_TRUST = 0.05
@@ -17,11 +17,20 @@ LEAST_TRUST = 0.05
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prior:
-    """Quadratic prior 0.5 |A x - b|^2 over the unknowns, ``hessian`` = A^T A."""
+    """Quadratic prior 0.5 |A x - b|^2 over the unknowns.
+
+    Attributes
+    ----------
+    A : (m, unknowns) sparse
+    b : (m,)
+    hessian : (unknowns, unknowns) A^T A, with a place for every entry that the pictures add
+    slots : (s, 8, 8) where in ``hessian.data`` a segment's unknowns meet
+    """
 
     A: sparse.csr_matrix
     b: Scalars
     hessian: sparse.csc_matrix
+    slots: Array
 
     def value(self, x: Scalars) -> float:
         """Half the squared norm."""
@@ -32,6 +41,14 @@ class Prior:
         """A^T (A x - b)."""
         out: Scalars = self.A.T @ (self.A @ x - self.b)
         return out
+
+    def added(self, blocks: Array) -> sparse.csc_matrix:
+        """Hessian of the prior and of (s, 8, 8) blocks, one per segment, together."""
+        H = self.hessian
+        data = H.data + np.bincount(
+            self.slots.reshape(-1), blocks.reshape(-1), minlength=len(H.data)
+        )
+        return sparse.csc_matrix((data, H.indices, H.indptr), shape=H.shape)
 
 
 def make_prior(tubes: Tubes, trust: Scalars, options: TubeOptions) -> Prior:
@@ -67,7 +84,40 @@ def make_prior(tubes: Tubes, trust: Scalars, options: TubeOptions) -> Prior:
         ]
     ).tocsr()
     b = np.concatenate([np.zeros(3 * bend.shape[0] + len(gap)), hold * start])
-    return Prior(A, b, (A.T @ A).tocsc())
+    hessian, slots = _with_places((A.T @ A).tocoo(), columns_of(tubes))
+    return Prior(A, b, hessian, slots)
+
+
+def columns_of(tubes: Tubes) -> Array:
+    """(s, 8) unknowns of each segment: position a (3), position b (3), log radius a, b."""
+    a, b = tubes.owner[tubes.first], tubes.owner[tubes.second]
+    axis = np.arange(3)
+    offset = 3 * len(tubes.positions_mm)
+    return np.concatenate(
+        [
+            3 * a[:, None] + axis,
+            3 * b[:, None] + axis,
+            (offset + tubes.first)[:, None],
+            (offset + tubes.second)[:, None],
+        ],
+        axis=1,
+    )
+
+
+def _with_places(matrix: sparse.coo_matrix, columns: Array) -> tuple[sparse.csc_matrix, Array]:
+    """Add zeros where segments' unknowns meet; (s, 8, 8) says where they are in the data."""
+    size = matrix.shape[0]
+    # Columns first: sorted, the keys are in the order of a CSC matrix.
+    met = (columns[:, None, :] * np.int64(size) + columns[:, :, None]).reshape(-1)
+    own = matrix.col.astype(np.int64) * size + matrix.row
+    keys = np.unique(np.concatenate([own, met]))
+    data = np.bincount(np.searchsorted(keys, own), matrix.data, minlength=len(keys))
+    pointer = np.searchsorted(keys, np.arange(size + 1) * np.int64(size))
+    hessian = sparse.csc_matrix(
+        (data.astype(np.float64), (keys % size).astype(np.int32), pointer.astype(np.int32)),
+        shape=(size, size),
+    )
+    return hessian, np.searchsorted(keys, met).reshape(len(columns), 8, 8)
 
 
 def _taper(tubes: Tubes, gap: Scalars, taper: float) -> sparse.csr_matrix:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.refine.tube import factorised
 from gcar_deploy.types import Array, Points, Scalars
 
 #: covariances are solved for every so many points and interpolated between.
-EVERY = 3
+EVERY = 5
 #: model error (sections that are not round, overlaps) makes neighbouring pixels err together;
 #: the pictures count as if they had so many times fewer independent pixels.
 CORRELATED_PIXELS = 6.0
@@ -38,7 +38,7 @@ def fit_sigma(hessian: sparse.csc_matrix, owner: Array, tangents: Points) -> Sca
     positions = len(tangents)
     if not positions:
         return np.zeros(0)
-    factor = splu(hessian.tocsc(), permc_spec="MMD_AT_PLUS_A")
+    factor = factorised(hessian)
     chosen = np.unique(np.concatenate([owner[::EVERY], owner[-1:]]))
     rhs = np.zeros((hessian.shape[0], 3 * len(chosen)))
     column = np.arange(3 * len(chosen))

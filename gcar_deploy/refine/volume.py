@@ -71,6 +71,7 @@ def tube_volume(
     centers: CenterPoints | None,
     edge_blur_mm: float,
     options: VolumeOptions,
+    model_mm: Sequence[Array] = (),
 ) -> Volume:
     """Occupancy of each voxel, 0 .. 1.
 
@@ -83,6 +84,7 @@ def tube_volume(
     centers : the points the fit started from, or None
     edge_blur_mm : as in the fit
     options : VolumeOptions
+    model_mm : per view (rows, cols) path of the tubes where the fit has it already, or empty
 
     Returns
     -------
@@ -92,15 +94,19 @@ def tube_volume(
     spacing = grid.spacing_mm
     if not options.fuse or not tree.branches or spacing.max() / spacing.min() > MAX_ANISOTROPY:
         return volume
-    blurred = ndimage.gaussian_filter(volume, BAND_BLUR, truncate=3.0)
+    near = _box_round(volume)
+    if near is None:
+        return volume
+    inner = volume[near]
+    blurred = ndimage.gaussian_filter(inner, BAND_BLUR, truncate=3.0)
     if np.count_nonzero(blurred > BAND) > options.max_cells:
         return volume
-    band = _band(volume, blurred, grid, options)
+    band = _band(inner, blurred, grid, np.array([part.start for part in near]), options)
     if not len(band.index):
         return volume
     G = _correlation(band, tree, options)
     operators, errors, variances = _pictures(
-        band, tree, grid, views, contrast, edge_blur_mm, options
+        band, tree, grid, views, contrast, edge_blur_mm, options, model_mm
     )
     centers = None if centers is None else usable_points(centers)
     if centers is not None and len(centers):
@@ -118,7 +124,23 @@ def tube_volume(
     return volume
 
 
-def _band(volume: Volume, blurred: Array, grid: Grid, options: VolumeOptions) -> _Band:
+def _box_round(volume: Volume) -> tuple[slice, ...] | None:
+    """Box of the voxels above 0 with as much room as the blur needs; None where there are none."""
+    some = volume > 0
+    room = int(3.0 * BAND_BLUR + 0.5)
+    out = []
+    for axis in range(3):
+        at = np.flatnonzero(some.any(axis=tuple(k for k in range(3) if k != axis)))
+        if not len(at):
+            return None
+        out.append(slice(max(int(at[0]) - room, 0), int(at[-1]) + room + 1))
+    return tuple(out)
+
+
+def _band(
+    volume: Volume, blurred: Array, grid: Grid, corner: Array, options: VolumeOptions
+) -> _Band:
+    """Voxels near the surface in a box of the grid whose first voxel is ``corner``."""
     near = blurred > BAND
     index = np.argwhere(near)
     lookup = np.full(np.asarray(near.shape) + 2 * REACH, -1, np.int64)
@@ -131,6 +153,7 @@ def _band(volume: Volume, blurred: Array, grid: Grid, options: VolumeOptions) ->
     which, row = np.nonzero(ok)
     half = np.clip(blurred[near].astype(np.float64), 0.0, 1.0)
     sigma2 = options.floor_sigma**2 + options.surface_sigma**2 * 4 * half * (1 - half)
+    index += corner
     return _Band(
         index=index,
         points_mm=grid.index2world(index),
@@ -166,6 +189,7 @@ def _pictures(
     contrast: Sequence[float],
     edge_blur_mm: float,
     options: VolumeOptions,
+    model_mm: Sequence[Array],
 ) -> tuple[list[sparse.csr_matrix], list[Scalars], list[Scalars]]:
     """Projector, path that the tubes leave unexplained, and its variance, per view."""
     tubes = tubes_of(tree)
@@ -173,11 +197,14 @@ def _pictures(
     operators: list[sparse.csr_matrix] = []
     errors: list[Scalars] = []
     variances: list[Scalars] = []
-    for view, factor in zip(views, contrast, strict=True):
+    for k, (view, factor) in enumerate(zip(views, contrast, strict=True)):
         if not view.calibrated:
             continue
         box = max(edge_blur_mm / view.carm.pixel_at_isocenter_mm, 0.05)
-        model = footprint(tubes, view.carm, box).image(view.path_mm.shape)
+        if len(model_mm):
+            model = model_mm[k]
+        else:
+            model = footprint(tubes, view.carm, box).image(view.path_mm.shape)
         rest = np.where(view.valid, view.path_mm / factor - model, 0.0)
         cells = cell_view(view.carm, view.path_mm, band.points_mm, h)
         rest = shrunk(view.carm, rest.astype(np.float32), h)[1]
@@ -196,7 +223,7 @@ def _points(
     ratio = centers.spacing_mm / h
     if not 1 / SAME_SPACING < ratio < SAME_SPACING:
         return None
-    density = _deposited(centers, grid)[tuple(band.index.T)] * ratio**3
+    density = _deposited(centers, grid, band.index) * ratio**3
     n = len(band.index)
     at = grid.world2index(centers.points_mm)
     if scatter_is_none(centers) and np.abs(at - np.rint(at)).max() < 0.02:
@@ -222,20 +249,24 @@ def _points(
     return K, density / max(scale, 1e-9) - expected, variance
 
 
-def _deposited(centers: CenterPoints, grid: Grid) -> Array:
-    """(nx, ny, nz) confidence deposited on the voxels, trilinear."""
+def _deposited(centers: CenterPoints, grid: Grid, index: Array) -> Scalars:
+    """(n,) confidence deposited on the (n, 3) voxels, trilinear."""
     at = grid.world2index(centers.points_mm)
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
     base = np.floor(at).astype(np.int64)
     share = at - base
-    out = np.zeros(int(np.prod(grid.shape)))
+    low = index.min(axis=0)
+    shape = index.max(axis=0) + 1 - low
+    flat, weight = [], []
     for corner in np.ndindex(2, 2, 2):
-        index = base + corner
-        weight = centers.confidence * np.where(corner, share, 1 - share).prod(axis=1)
-        ok = ((index >= 0) & (index < grid.shape)).all(axis=1) & (weight > 0)
-        flat = np.ravel_multi_index(tuple(index[ok].T), grid.shape)
-        out += np.bincount(flat, weight[ok], minlength=len(out))
-    return out.reshape(grid.shape)
+        place = base + corner - low
+        part = centers.confidence * np.where(corner, share, 1 - share).prod(axis=1)
+        ok = ((place >= 0) & (place < shape)).all(axis=1) & (part > 0)
+        flat.append(np.ravel_multi_index(tuple(place[ok].T), tuple(shape)))
+        weight.append(part[ok])
+    out = np.bincount(np.concatenate(flat), np.concatenate(weight), minlength=int(shape.prod()))
+    here: Scalars = out[np.ravel_multi_index(tuple((index - low).T), tuple(shape))]
+    return here
 
 
 def scatter_voxels(tree: Tree, centers: CenterPoints) -> float:

@@ -121,11 +121,20 @@ def cell_graph(centers: CenterPoints, options: TreeOptions) -> CellGraph:
         empty = sparse.csr_matrix((0, 0))
         return CellGraph(np.zeros((0, 3)), np.zeros(0), np.zeros(0), empty, empty, h)
     pick = tuple(cells.T)
-    outside = np.argwhere(ndimage.binary_dilation(mask, np.ones((3, 3, 3))) & ~mask)
+    outside = np.argwhere(_grown(cells, mask.shape) & ~mask)
     depth = cKDTree(outside).query(cells)[0]
     cost, length = _steps(cells, value[pick], _relative(middle, pick), options)
     points = origin + (cells + low) * h
     return CellGraph(points, value[pick], depth, cost, length, h)
+
+
+def _grown(cells: Array, shape: tuple[int, ...]) -> Array:
+    """Mask of the cells and their 26 neighbours; no cell lies on the border of ``shape``."""
+    out = np.zeros(int(np.prod(shape)), bool)
+    flat = np.ravel_multi_index(tuple(cells.T), shape)
+    for dx, dy, dz in np.ndindex(3, 3, 3):
+        out[flat + ((dx - 1) * shape[1] + dy - 1) * shape[2] + dz - 1] = True
+    return out.reshape(shape)
 
 
 def _splat(at: Array, weight: Scalars, shape: Array) -> Array:

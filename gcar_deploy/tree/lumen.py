@@ -9,7 +9,7 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Scalars
+from gcar_deploy.types import Array, Scalars
 
 #: a stretch this much narrower than its reference (share) counts as lesion.
 LESION_SHARE = 0.25
@@ -68,16 +68,12 @@ def branch_lumen(branch: Branch, number: int = 0) -> BranchLumen:
     weight = np.gradient(arc) if len(arc) > 1 else np.ones(len(arc))
     mean = float(np.average(diameter, weights=np.maximum(weight, 1e-9)))
     short = BranchLumen(branch=number, length_mm=float(arc[-1]), mean_diameter_mm=mean)
-    inner = (arc >= END_RADII * branch.radius_mm[0]) & (
-        arc <= arc[-1] - END_RADII * branch.radius_mm[-1]
-    )
-    if np.count_nonzero(inner) < MIN_POINTS:
+    at, reference = reference_stretch(branch)
+    if not len(at):
         return short
-    reference = reference_curve(arc[inner], diameter[inner])
-    at = np.flatnonzero(inner)
     # The most severe narrowing, not the narrowest point, which may just be the thin far end.
-    k = int(np.argmin(diameter[inner] / reference))
-    narrow = diameter[inner] < (1 - LESION_SHARE) * reference
+    k = int(np.argmin(diameter[at] / reference))
+    narrow = diameter[at] < (1 - LESION_SHARE) * reference
     lesion = 0.0
     if narrow[k]:
         first, last = k, k
@@ -95,6 +91,24 @@ def branch_lumen(branch: Branch, number: int = 0) -> BranchLumen:
         stenosis_percent=max(0.0, 100.0 * (1.0 - minimal / float(reference[k]))),
         lesion_length_mm=lesion,
     )
+
+
+def reference_stretch(branch: Branch) -> tuple[Array, Scalars]:
+    """Points of a branch that are clear of its ends, and the healthy diameter there.
+
+    Returns
+    -------
+    at : (m,) int, points; none where the branch is too short to say
+    reference_mm : (m,)
+    """
+    arc, diameter = diameter_curve(branch)
+    clear = (arc >= END_RADII * branch.radius_mm[0]) & (
+        arc <= arc[-1] - END_RADII * branch.radius_mm[-1]
+    )
+    at = np.flatnonzero(clear)
+    if len(at) < MIN_POINTS:
+        return at[:0], diameter[:0]
+    return at, reference_curve(arc[at], diameter[at])
 
 
 def diameter_curve(branch: Branch) -> tuple[Scalars, Scalars]:

@@ -132,9 +132,20 @@ def _supersampled(
     starts, ends, *radii = capsules
     thin = [np.sqrt(np.maximum(r * r - width * width / 12, 0.01 * width * width)) for r in radii]
     capsules = (starts, ends, thin[0], thin[1])
+    a, b, ra, rb = (np.ascontiguousarray(x[capsule]) for x in capsules)
+    axis, rel = b - a, center - a
+    length2 = np.maximum(np.einsum("ij,ij->i", axis, axis), 1e-18)
+    inverse, taper = 1.0 / length2, rb - ra
+    # With x = rel + offset: |x - t axis|^2 = |x|^2 - t (2 x.axis - t |axis|^2).
+    along0 = np.einsum("ij,ij->i", rel, axis)
+    square0 = np.einsum("ij,ij->i", rel, rel)
     total = np.zeros(count)
     for offset in offsets * grid.spacing_mm:
-        distance = capsule_distance(center + offset, capsules, capsule)
+        along = along0 + axis @ offset
+        square = square0 + (2 * rel) @ offset + offset @ offset
+        t = np.clip(along * inverse, 0.0, 1.0)
+        square -= t * (2 * along - t * length2)
+        distance = np.sqrt(np.maximum(square, 0.0)) - (ra + t * taper)
         inside = np.minimum.reduceat(distance, first)
         total += np.clip(0.5 - inside / width, 0.0, 1.0)
     return (total / len(offsets)).astype(np.float32)

@@ -41,7 +41,7 @@ def test_a_checkpoint_of_another_size_goes_through(exported):
     assert spec["name"] == "m" and spec["opset"] == 18 and spec["ir_version"] == 10
     assert spec["sha256"] == hashlib.sha256(model.read_bytes()).hexdigest()
     assert {f.name for f in model.parent.iterdir()} == {
-        "checkpoint.safetensors", "manifest.json", "m.onnx", "m.json",
+        "checkpoint.safetensors", "manifest.json", "m.onnx", "m.json", "m.golden.npz",
     }  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def test_int8_is_kept_or_refused_with_figures(exported, monkeypatch):
     assert model.read_bytes() == before
 
 
-@pytest.mark.parametrize("manifest", [None, "{", json.dumps({"network": "forest", "config": {}})])
+@pytest.mark.parametrize("manifest", [None, "{", json.dumps({"network": "unet", "config": {}})])
 def test_a_checkpoint_without_a_usable_manifest_is_refused(tmp_path, manifest):
     save_file({"step": torch.zeros(1)}, tmp_path / "c.safetensors")
     if manifest is not None:

@@ -9,7 +9,6 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from gcar_export.losses import (
-    FOREGROUND,
     PAPER_START,
     chamfer,
     chamfer_weight,
@@ -119,7 +118,7 @@ def test_depth_loss_is_the_sum_of_its_three_terms():
     mask = torch.tensor([[True, True], [True, False]])
     expected = float(silog(predicted[mask].float(), truth[mask].float()))
     # Masked square, a mean; one pair of rows with equal errors, one pair of columns 0.1 apart.
-    expected += FOREGROUND * ((0.01 + 0.04 + 0.01) / 3 + 0.0 + 0.1)
+    expected += (0.01 + 0.04 + 0.01) / 3 + 0.0 + 0.1
     assert float(depth_loss(predicted, truth, mask)) == pytest.approx(expected, rel=1e-5)
 
 

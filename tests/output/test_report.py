@@ -79,11 +79,15 @@ def test_policy_allows_exactly_the_own_script_and_style(page):
         assert not any(name.startswith("on") or name == "style" for name in attributes)
 
 
-def test_data_are_the_tree(page, result):
+def test_data_are_the_tree(page, result, text):
     data = json.loads(page.bodies["script"][0])
     assert len(data["branches"]) == len(result.tree.branches)
     assert len(data["branches"][0]["points"]) == len(result.tree.branches[0])
-    assert len(data["views"]) == 2
+    # The two directions and the best further one.
+    assert len(data["views"]) == 3
+    further = result.summary()["best_further_view"]
+    assert data["views"][2] == [further["primary_angle_deg"], further["secondary_angle_deg"]]
+    assert further["name"] in text
 
 
 def test_research_use_is_said_and_size_is_small(text):

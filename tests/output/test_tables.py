@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.output.report import _jpeg, _scene, report_html
+from gcar_deploy.output.report import _jpeg, report_html
+from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.tables import centerline_csv, centerline_vtp, gaussians_npz, gaussians_ply
 from gcar_deploy.tree.tree import Branch, Tree
 
@@ -91,10 +92,11 @@ def long_tree(branches=40, points=400):
 def test_report_stays_small_for_noisy_pictures_and_long_trees(result):
     tree = long_tree()
     long = dataclasses.replace(result, tree=tree)
-    noise = np.random.default_rng(0).integers(0, 255, (1024, 1024, 3), dtype=np.uint8)
-    assert len(report_html(long, long.summary(), [noise, noise])) < 1_500_000
-    drawn = _scene(long)["branches"]
-    assert sum(len(branch["points"]) for branch in drawn) < 3500
+    noise = np.random.default_rng(0).normal(120, 12, (512, 512)).clip(0, 255).astype(np.uint8)
+    picture = np.repeat(np.kron(noise, np.ones((2, 2), np.uint8))[..., None], 3, axis=2)
+    assert len(report_html(long, long.summary(), [picture, picture])) < 500_000
+    drawn = scene_data(long, None)["branches"]
+    assert sum(len(branch["points"]) for branch in drawn) < 2100
     assert all(branch["arc"][-1] == pytest.approx(tree.branches[0].length_mm, abs=0.01)
                for branch in drawn)  # fmt: skip
 
@@ -104,3 +106,48 @@ def test_report_pictures_fit_their_budget():
     grey = np.repeat(np.repeat(rng.normal(120, 12, (512, 512)), 2, 0), 2, 1)
     picture = np.repeat(grey.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
     assert len(_jpeg(picture, 120_000)) <= 120_000
+
+
+def test_lumen_figures_are_in_the_summary_and_in_the_vtp(result, tmp_path):
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    s = np.linspace(0.0, 40.0, 81)
+    # A healthy diameter of 3 mm narrowed to 1.5 mm in the middle, some 8 mm long.
+    radius = 1.5 - 0.75 * np.exp(-0.5 * ((s - 20.0) / 2.5) ** 2)
+    narrow = Branch(
+        points_mm=np.stack([s, 0 * s, 0 * s], axis=1), radius_mm=radius,
+        sigma_mm=np.full(81, 0.1), confidence=np.ones(81), start=0, end=1,
+    )  # fmt: skip
+    tree = Tree(nodes_mm=narrow.points_mm[[0, -1]], branches=(narrow,))
+    row = dataclasses.replace(result, tree=tree).summary()["tree"]["branches"][0]
+    assert row["minimal_diameter_mm"] == pytest.approx(1.5, abs=1e-6)
+    assert row["minimal_at_mm"] == pytest.approx(20.0)
+    assert row["stenosis_percent"] == pytest.approx(50.0, abs=2.0)
+    assert row["lesion_length_mm"] == pytest.approx(2 * 2.5 * np.sqrt(2 * np.log(2)), abs=1.0)
+    file = tmp_path / "line.vtp"
+    file.write_bytes(centerline_vtp(tree))
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(file))
+    reader.Update()
+    cells = reader.GetOutput().GetCellData()
+    for name, key in (
+        ("MinimalDiameter", "minimal_diameter_mm"), ("StenosisPercent", "stenosis_percent"),
+        ("ReferenceDiameter", "reference_diameter_mm"), ("LesionLength", "lesion_length_mm"),
+    ):  # fmt: skip
+        assert vtk_to_numpy(cells.GetArray(name))[0] == pytest.approx(row[key])
+
+
+def test_a_fork_tells_its_angles_and_a_short_branch_why_it_says_nothing(result):
+    from tests.tree.shapes import branch
+
+    stub = branch([[0, 0, 0], [0, 0, 1.0]], 1.5, 1, 3)
+    lines = [branch([[-20, 0, 0], [0, 0, 0]], 1.5), branch([[0, 0, 0], [20, 0, 0]], 1.5, 1, 2)]
+    nodes = np.array([[-20, 0, 0], [0, 0, 0], [20, 0, 0], [0, 0, 1.0]])
+    tree = Tree(nodes_mm=nodes, branches=(*lines, stub))
+    summary = dataclasses.replace(result, tree=tree).summary()
+    (node,) = summary["tree"]["bifurcations"]
+    assert node["node"] == 1 and node["position_mm"] == [0, 0, 0]
+    found = {tuple(a["branches"]): a["angle_deg"] for a in node["angles"]}
+    assert found == pytest.approx({(0, 1): 180.0, (0, 2): 90.0, (1, 2): 90.0})
+    assert "too short" in summary["reasons"]["/tree/branches/2/stenosis_percent"]

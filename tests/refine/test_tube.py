@@ -55,6 +55,35 @@ def test_gradient_matches_differences():
     assert np.abs(errors).max() < 0.05 * np.abs(gradient[split:]).max()
 
 
+def test_hessian_is_the_sum_over_entries():
+    truth = fork()
+    targets = make_targets(seen(truth, two_views(128, 1.0)), 1.0, OPTIONS)
+    tubes = tubes_of(truth)
+    prior = prior_of(tubes)
+    prints = footprints(tubes, targets)
+    hessian, _ = normal_equations(tubes, targets, prints, prior, OPTIONS)
+    p, n = len(tubes.positions_mm), len(tubes.log_radius)
+    expected = (prior.A.T @ prior.A).toarray()
+    for target, print_ in zip(targets, prints, strict=True):
+        model = print_.image(target.path_mm.shape).reshape(-1)
+        by_pixel = target.carm.jacobian(tubes.points_mm)
+        for k in range(0, len(print_.pixel)):
+            pixel, s = print_.pixel[k], print_.segment[k]
+            row = np.zeros(3 * p + n)
+            for point, share in ((tubes.first[s], 1 - print_.t[k]), (tubes.second[s], print_.t[k])):
+                at = 3 * tubes.owner[point]
+                row[at : at + 3] -= (
+                    share * print_.d_distance[k] * (print_.normal[k] @ by_pixel[point])
+                )
+                row[3 * p + point] += share * print_.d_log_radius[k]
+            sigma = target.sigma_mm.reshape(-1)[pixel]
+            z = (target.path_mm.reshape(-1)[pixel] - model[pixel]) / (OPTIONS.robust_sigmas * sigma)
+            weight = target.weight.reshape(-1)[pixel] / (1 + z * z)
+            weight *= print_.crossings[k] * (target.pixel_mm / sigma) ** 2
+            expected += weight * np.outer(row, row)
+    np.testing.assert_allclose(hessian.toarray(), expected, atol=1e-9 * np.abs(expected).max())
+
+
 def test_a_moved_tree_comes_back():
     truth = fork()
     views = seen(truth, two_views())
@@ -72,7 +101,7 @@ def test_a_moved_tree_comes_back():
     progress = Progress()
     for level in (1.0, 0.0):
         targets = make_targets(views, level, OPTIONS)
-        tubes = fit_level(tubes, targets, prior_of(tubes_of(moved)), OPTIONS, 8, progress)
+        tubes, _ = fit_level(tubes, targets, prior_of(tubes_of(moved)), OPTIONS, 8, progress)
     dense = np.concatenate([b.points_mm for b in truth.branches])
     after = cKDTree(dense).query(tubes.points_mm)[0]
     assert np.median(after) < 0.5 * np.median(before)

@@ -85,3 +85,43 @@ def test_behind_the_source_and_outside_the_picture_is_empty():
         for view in (carm(0, 0), *two_views()):
             picture = footprint(tubes_of(moved), view, 1.0).image((256, 256))
             assert np.isfinite(picture).all()
+
+
+def test_picture_of_one_branch_against_every_pixel_and_every_segment():
+    t = np.linspace(0, 3 * np.pi, 61)
+    line = np.stack([12 * np.cos(t), 12 * np.sin(t), np.linspace(-12, 12, 61)], 1)
+    tree = Tree(nodes_mm=line[[0, -1]], branches=(branch(line, 1.1),))
+    view = carm(25, -15)
+    seen = footprint(tubes_of(tree), view, 1.0)
+    pixels, depth = view.project(line)
+    a, step = pixels[:-1], np.diff(pixels, axis=0)
+    grid = np.stack(np.meshgrid(np.arange(256), np.arange(256)), -1).reshape(-1, 1, 2)
+    s = np.clip(np.sum((grid - a) * step, -1) / np.sum(step * step, -1), 0, 1)
+    distance = np.linalg.norm(grid - a - s[..., None] * step, axis=-1).min(axis=1)
+    reach = 1.1 * np.sqrt(np.prod(view.focal_px)) / depth + 0.5
+    # Every pixel within reach of some segment is covered, no other is.
+    covered = np.zeros(256 * 256, bool)
+    covered[seen.pixel] = True
+    assert covered[distance < reach.min() - 1e-6].all()
+    assert not covered[distance > reach.max() + 1e-6].any()
+    # Entries come in order of their pixels; where a pixel has one, it is the nearest segment's.
+    assert (np.diff(seen.pixel) >= 0).all()
+    single = seen.crossings == 1
+    axis = a[seen.segment] + seen.t[:, None] * step[seen.segment]
+    own = np.linalg.norm(grid[seen.pixel, 0] - axis, axis=1)
+    np.testing.assert_allclose(own[single], distance[seen.pixel[single]], atol=1e-3)
+    np.testing.assert_allclose(
+        seen.image((256, 256)).reshape(-1)[seen.pixel[seen.first]], seen.totals()
+    )
+
+
+def test_path_is_continuous_where_segments_meet():
+    # A bend towards the beam: the two segments' own angles to the ray differ.
+    line = np.array([[-10.0, 0, 0], [-5, 0, 0], [0, 0, 0], [4, 3, 0], [8, 6, 0], [12, 9, 0]])
+    tree = Tree(nodes_mm=line[[0, -1]], branches=(branch(line, 1.5),))
+    view = carm(0, 0)
+    before, after = (
+        footprint(tubes_of(tree), view.moved([dx, 0, 0]), 1.0).image((256, 256))
+        for dx in (-1e-6, 1e-6)
+    )
+    assert np.abs(before - after).max() < 1e-3

@@ -1,0 +1,137 @@
+"""Run a table of cases: what is missing alone, rows as they come, a summary at the end."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.batch.cases import BatchCase
+from gcar_deploy.batch.pools import in_processes, on_dask
+from gcar_deploy.batch.summary import write_summary
+from gcar_deploy.batch.work import BatchJob
+from gcar_deploy.errors import UsageError
+
+SCHEMA = "gcar-batch/1"
+#: called with (cases done, cases in all, name of the last)
+OnCase = Callable[[int, int, str], None]
+
+
+def run_batch(
+    cases: Sequence[BatchCase],
+    out: Path,
+    options: Mapping[str, Any],
+    *,
+    processes: int = 1,
+    scheduler: str | None = None,
+    force: bool = False,
+    on_case: OnCase | None = None,
+) -> list[dict[str, Any]]:
+    """Run every case that has no row yet; write ``summary.csv`` and ``summary.html``.
+
+    Parameters
+    ----------
+    cases : as ``read_cases`` returns them
+    out : folder of an earlier run of the same, or a new one
+    options : predictor, refiner, model, threads, deadline_s
+    processes : on this machine
+    scheduler : address of a Dask scheduler instead, or None
+    force : run cases again whose files or options have changed since, and failed ones
+    on_case : told of each finished case
+
+    Returns
+    -------
+    one row a case, in the order of the table
+
+    Raises
+    ------
+    UsageError
+        ``out`` holds something else, or a case changed and ``force`` was not given.
+    """
+    rows_folder = _own(out)
+    rows: dict[str, dict[str, Any]] = {}
+    missing: list[BatchJob] = []
+    for case in cases:
+        fingerprint = case.fingerprint(options)
+        row = _read_row(rows_folder / f"{case.name}.json")
+        if row is not None and row["fingerprint"] != fingerprint and not force:
+            raise UsageError(
+                f"case {case.name!r}: its files or options changed since it was done in {out}; "
+                "choose another folder or add --force"
+            )
+        failed = row is not None and row["status"] == "failed"
+        if row is not None and row["fingerprint"] == fingerprint and not (force and failed):
+            rows[case.name] = row
+            continue
+        missing.append(_job(case, out, rows_folder, fingerprint, options, scheduler))
+    if on_case is not None:
+        on_case(len(rows), len(cases), "")
+    for row in _done(missing, processes, scheduler):
+        _write_row(rows_folder / f"{row['case']}.json", row)
+        rows[row["case"]] = row
+        if on_case is not None:
+            on_case(len(rows), len(cases), row["case"])
+    ordered = [rows[case.name] for case in cases]
+    write_summary(ordered, out)
+    return ordered
+
+
+def _own(out: Path) -> Path:
+    """Make the folder, or recognise it as a batch's."""
+    mark = out / "batch.json"
+    if out.exists() and not mark.is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out} exists and holds no batch; choose another folder")
+    rows = out / "rows"
+    try:
+        rows.mkdir(parents=True, exist_ok=True)
+        mark.write_text(json.dumps({"schema": SCHEMA}) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{out} cannot be made ({error.strerror})") from None
+    for left in rows.glob("*.running"):
+        left.unlink(missing_ok=True)
+    return rows
+
+
+def _job(
+    case: BatchCase,
+    out: Path,
+    rows: Path,
+    fingerprint: str,
+    options: Mapping[str, Any],
+    scheduler: str | None,
+) -> BatchJob:
+    # The workers of a cluster have working folders of their own.
+    return BatchJob(
+        case=case.name,
+        views=tuple(str(path.absolute()) for path in case.views),
+        geometry=None if case.geometry is None else str(case.geometry.absolute()),
+        out=str((out / case.name).absolute()),
+        marker=str((rows / f"{case.name}.running").absolute()) if scheduler is None else None,
+        fingerprint=fingerprint,
+        **options,
+    )
+
+
+def _done(
+    jobs: Sequence[BatchJob], processes: int, scheduler: str | None
+) -> Iterator[dict[str, Any]]:
+    if not jobs:
+        return iter(())
+    return in_processes(jobs, processes) if scheduler is None else on_dask(jobs, scheduler)
+
+
+def _read_row(path: Path) -> dict[str, Any] | None:
+    try:
+        row = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    known = isinstance(row, dict) and {"case", "status", "fingerprint"} <= row.keys()
+    return row if known else None
+
+
+def _write_row(path: Path, row: Mapping[str, Any]) -> None:
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    partial.write_text(json.dumps(row, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    partial.replace(path)

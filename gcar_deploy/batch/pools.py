@@ -1,0 +1,105 @@
+"""Where the cases run: processes of this machine, or the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.batch.work import BatchJob, error_row, prepare_process, run_case
+from gcar_deploy.errors import UsageError
+
+#: seconds to reach a scheduler
+CONNECT_S = 30
+
+
+def in_processes(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str, Any]]:
+    """Yield each case's row as it is done.
+
+    A process that dies (out of memory, a crash in a library) takes its pool along: the cases
+    that were running are then run alone, one by one, and the one that kills its process again
+    gets a row that says so.
+    """
+    waiting = list(jobs)
+    while waiting:
+        finished: set[str] = set()
+        try:
+            for row in _pool(waiting, processes):
+                finished.add(row["case"])
+                yield row
+        except BrokenProcessPool:
+            suspects = [
+                job
+                for job in waiting
+                if job.case not in finished and job.marker and Path(job.marker).exists()
+            ]
+            # Killed before any case began: the machine, not a case, is at fault.
+            for job in suspects or [job for job in waiting if job.case not in finished][:1]:
+                finished.add(job.case)
+                yield _alone(job)
+        waiting = [job for job in waiting if job.case not in finished]
+
+
+def _pool(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str, Any]]:
+    # Spawned, not forked: numerical libraries keep threads that do not survive a fork.
+    with concurrent.futures.ProcessPoolExecutor(
+        min(processes, len(jobs)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=prepare_process,
+        initargs=(jobs[0].threads,),
+    ) as pool:
+        try:
+            for future in concurrent.futures.as_completed(
+                [pool.submit(run_case, job) for job in jobs]
+            ):
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _alone(job: BatchJob) -> dict[str, Any]:
+    try:
+        return next(_pool([job], 1))
+    except BrokenProcessPool:
+        if job.marker is not None:
+            Path(job.marker).unlink(missing_ok=True)
+        row = error_row(job.case, "failed", "its process died; out of memory?", 1)
+        return {**row, "fingerprint": job.fingerprint}
+
+
+def on_dask(jobs: Sequence[BatchJob], scheduler: str) -> Iterator[dict[str, Any]]:
+    """Yield each case's row as it is done by a cluster that sees the same files.
+
+    Raises
+    ------
+    UsageError
+        The library is missing, or the scheduler does not answer.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ModuleNotFoundError:
+        raise UsageError("distributed is not installed: pip install 'gcar[dask]'") from None
+    try:
+        client = Client(scheduler, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"scheduler {scheduler} does not answer ({error})") from None
+    with client:
+        # Not pure: the folder that a case writes is the point of it.
+        case_of = {
+            client.submit(
+                run_case, job, pure=False, key=f"gcar-{job.case}-{job.fingerprint[:16]}"
+            ): job
+            for job in jobs
+        }
+        for future in as_completed(list(case_of)):
+            job = case_of[future]
+            failure = future.exception()
+            if failure is None:
+                yield future.result()
+            else:
+                text = f"its worker failed: {type(failure).__name__}"
+                yield {**error_row(job.case, "failed", text, 1), "fingerprint": job.fingerprint}

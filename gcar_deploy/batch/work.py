@@ -1,0 +1,124 @@
+"""One case from files to a row; whatever goes wrong with it becomes the row."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.errors import CancelledError, GcarError, RefusedError
+
+#: columns of summary.csv, in order
+COLUMNS = (
+    "case", "status", "exit_code", "sentence", "branches", "length_mm", "gaussians",
+    "separation_deg", "least_coverage", "largest_stenosis_percent", "seconds",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BatchJob:
+    """One case to be done, in plain values that travel between processes.
+
+    Attributes
+    ----------
+    case : name
+    views, geometry : files
+    out : result folder
+    marker : exists while the case runs, so that a process that dies names its case; or None
+    fingerprint : of everything the result depends on
+    predictor, refiner, model, threads, deadline_s : as the options of ``gcar run``
+    """
+
+    case: str
+    views: tuple[str, ...]
+    geometry: str | None
+    out: str
+    marker: str | None
+    fingerprint: str
+    predictor: str
+    refiner: str
+    model: str | None
+    threads: int | None
+    deadline_s: float | None
+
+
+def run_case(job: BatchJob) -> dict[str, Any]:
+    """Reconstruct one case and write its folder; errors are rows, not exceptions."""
+    marker = None if job.marker is None else Path(job.marker)
+    if marker is not None:
+        marker.touch()
+    try:
+        return {**_solved(job), "fingerprint": job.fingerprint}
+    finally:
+        if marker is not None:
+            marker.unlink(missing_ok=True)
+
+
+def error_row(case: str, status: str, sentence: str, exit_code: int) -> dict[str, Any]:
+    """Return the row of a case without a result."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row.update(case=case, status=status, exit_code=exit_code, sentence=" ".join(sentence.split()))
+    return row
+
+
+def prepare_process(threads: int | None) -> None:
+    """Set up a process that does cases: interrupts belong to its parent, threads are few."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if threads is not None:
+        import cv2
+
+        cv2.setNumThreads(threads)
+
+
+@functools.lru_cache(maxsize=2)
+def _engine(model: str | None, threads: int | None, predictor: str, refiner: str) -> Any:
+    from gcar_deploy.config import RunOptions
+    from gcar_deploy.engine import Engine
+
+    options = RunOptions()
+    options = dataclasses.replace(
+        options,
+        predict=dataclasses.replace(options.predict, predictor=predictor),
+        refine=dataclasses.replace(options.refine, refiner=refiner),
+    )
+    return Engine(model, threads=threads, options=options)
+
+
+def _solved(job: BatchJob) -> dict[str, Any]:
+    try:
+        engine = _engine(job.model, job.threads, job.predictor, job.refiner)
+        result = engine.reconstruct(list(job.views), job.geometry, deadline_s=job.deadline_s)
+        out = Path(job.out)
+        # A folder without a row is what an interrupted batch left.
+        result.save(out, force=(out / "result.json").is_file())
+        return _row(job.case, result.summary())
+    except RefusedError as error:
+        return error_row(job.case, "refused", str(error), error.exit_code)
+    except CancelledError as error:
+        return error_row(job.case, "failed", str(error), error.exit_code)
+    except GcarError as error:
+        return error_row(job.case, "failed", str(error), error.exit_code)
+    except Exception as error:  # noqa: BLE001 - one broken case must not stop the rest
+        return error_row(job.case, "failed", f"internal error: {type(error).__name__} {error}", 1)
+
+
+def _row(case: str, summary: Mapping[str, Any]) -> dict[str, Any]:
+    coverage = [view["coverage"] for view in summary["views"] if view["coverage"] is not None]
+    stenoses = [branch["stenosis_percent"] for branch in summary["tree"]["branches"]]
+    known = [percent for percent in stenoses if percent is not None]
+    return {
+        "case": case,
+        "status": summary["status"],
+        "exit_code": 0,
+        "sentence": summary["sentence"],
+        "branches": len(summary["tree"]["branches"]),
+        "length_mm": round(summary["tree"]["length_mm"], 2),
+        "gaussians": summary["counts"]["gaussians"],
+        "separation_deg": round(summary["separation_deg"], 2),
+        "least_coverage": round(min(coverage), 4) if coverage else None,
+        "largest_stenosis_percent": round(max(known), 1) if known else None,
+        "seconds": round(summary["seconds"]["total"], 3),
+    }

@@ -1,0 +1,169 @@
+"""gcar serve: a warm worker for host programs in any language."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gcar_deploy.cli.common import (
+    limit_threads,
+    needs_extra,
+    predictor_options,
+    run_options,
+    set_up_logging,
+)
+
+_LEAST_TOKEN = 16
+TOKEN_VARIABLE = "GCAR_TOKEN"  # noqa: S105 - the name of a variable
+
+
+@click.command("serve")
+@click.option(
+    "--stdio", is_flag=True, help="JSON-RPC 2.0 lines on standard input and output; no network."
+)
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Of 127.0.0.1; 0 takes a free one."
+)
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    default=None,
+    help="Orders may name files in this folder and put results there.",
+)
+@click.option(
+    "--token-file",
+    type=click.Path(path_type=Path),
+    default=None,
+    help=f"Holds the token; else {TOKEN_VARIABLE}, else one is made and printed once.",
+)
+@click.option(
+    "--limit",
+    type=click.FloatRange(min=0, min_open=True),
+    default=120.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="The longest deadline of a job.",
+)
+@click.option(
+    "--body-mib", type=click.IntRange(1, 4096), default=256, show_default=True,
+    help="The largest request, MiB.",
+)  # fmt: skip
+@click.option(
+    "--queue", "waiting", type=click.IntRange(1, 1000), default=32, show_default=True,
+    help="Jobs that may wait.",
+)  # fmt: skip
+@predictor_options
+@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+def serve(
+    stdio: bool,
+    port: int,
+    folder: Path | None,
+    token_file: Path | None,
+    limit: float,
+    body_mib: int,
+    waiting: int,
+    predictor: str,
+    model: str | None,
+    refiner: str,
+    threads: int | None,
+    verbose: bool,
+) -> None:
+    """Keep an engine warm and reconstruct what host programs send.
+
+    HTTP with JSON on 127.0.0.1 alone, behind a bearer token (GET /openapi.json describes it),
+    or JSON lines with --stdio. Ctrl-C or SIGTERM ends it: open jobs are cancelled.
+
+    \b
+    Example:
+      gcar serve --port 8790 --folder cases
+    """  # noqa: D301 - click wants a real backspace
+    set_up_logging(verbose, quiet=False)
+    limit_threads(threads)
+    token = None if stdio else read_token(token_file)
+    # SIGTERM, like Ctrl-C, ends a server in good order.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    from gcar_deploy.engine import Engine
+    from gcar_deploy.worker.folder import AllowedFolder
+    from gcar_deploy.worker.jobs import JobQueue
+    from gcar_deploy.worker.orders import do_order
+
+    allowed = None if folder is None else AllowedFolder(folder)
+    engine = Engine(model, threads=threads, options=run_options(predictor, refiner))
+    engine.warmup()
+
+    def work(order: Any, on_progress: Any, cancel: Any) -> Any:
+        return do_order(engine, order, on_progress, cancel, limit_s=limit)
+
+    def make_queue(on_change: Any = None) -> JobQueue:
+        return JobQueue(work, most_waiting=waiting, on_change=on_change)
+
+    if stdio:
+        _serve_lines(make_queue, allowed)
+    else:
+        _serve_http(make_queue(), allowed, token, port, body_mib)
+
+
+def _serve_lines(make_queue: Any, allowed: Any) -> None:
+    from gcar_deploy.worker.stdio import LineServer
+
+    # What a library prints must not stand between the messages.
+    private = os.dup(1)
+    os.dup2(2, 1)
+    with os.fdopen(private, "w", encoding="utf-8") as sink:
+        try:
+            LineServer(make_queue, allowed, sys.stdin, sink).run()
+        except KeyboardInterrupt:
+            return
+
+
+def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib: int) -> None:
+    try:
+        with needs_extra("serve", "flask", "waitress"):
+            from gcar_deploy.worker.http import LOOPBACK, create_app, listen
+        fresh = token is None
+        token = token or secrets.token_urlsafe(32)
+        server = listen(create_app(queue, token, folder=allowed, body_mib=body_mib), port)
+        click.echo(f"gcar: http://{LOOPBACK}:{server.effective_port}", err=True)
+        if fresh:
+            click.echo(f"gcar: token {token}", err=True)
+        try:
+            server.run()
+        except KeyboardInterrupt:
+            click.echo("gcar: stopping", err=True)
+        finally:
+            server.close()
+    finally:
+        queue.close()
+
+
+def read_token(file: Path | None) -> str | None:
+    """Return the token that the user gave, or None.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be read, others may read it, or the token is short or odd.
+    """
+    from gcar_deploy.errors import UsageError
+
+    if file is None:
+        token, where = os.environ.get(TOKEN_VARIABLE, ""), TOKEN_VARIABLE
+        if not token:
+            return None
+    else:
+        where = str(file)
+        try:
+            if os.name == "posix" and file.stat().st_mode & 0o077:
+                raise UsageError(f"{file} can be read by others; chmod 600 it")
+            token = file.read_text(encoding="ascii").strip()
+        except (OSError, UnicodeDecodeError):
+            raise UsageError(f"{file} cannot be read as a token") from None
+    if len(token) < _LEAST_TOKEN or not token.isprintable() or " " in token:
+        raise UsageError(f"{where}: a token has {_LEAST_TOKEN} or more characters and no spaces")
+    return token

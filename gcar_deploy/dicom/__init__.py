@@ -1,0 +1,1 @@
+"""DICOM XA: X-ray angiography runs, classic and Enhanced, to pictures with their C-arm."""

@@ -1,0 +1,228 @@
+"""The geometry of one frame: attributes of the header to a CArm, with what is worth saying.
+
+DICOM's positioner angles are the contract's (LAO and cranial positive), ``ImagerPixelSpacing`` is
+the spacing at the detector. ``PixelSpacing`` is a calibration in the patient and never used.
+"""
+
+from __future__ import annotations
+
+import math
+
+from gcar_deploy.config import DicomOptions
+from gcar_deploy.dicom.header import Header, tag
+from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.carm import CArm
+
+_WAY_OUT = "give the geometry with --geom"
+
+
+def frame_carm(header: Header, frame: int, options: DicomOptions) -> tuple[CArm, list[str]]:
+    """Read the C-arm of one frame.
+
+    Parameters
+    ----------
+    header : Header
+    frame : int, from 0
+    options : DicomOptions; what they supply is used only where the file is silent
+
+    Returns
+    -------
+    carm : CArm of the frame as ``scene.read_run`` hands its pixels on (horizontal flip undone)
+    notes : sentences, without the file's name
+
+    Raises
+    ------
+    GeometryError
+        An attribute is missing (named with the option that supplies it), out of range, or says
+        that the beam is no cone that meets the detector at a right angle.
+    """
+    try:
+        notes: list[str] = []
+        primary, secondary = _angles(header, frame)
+        sod, sdd = _distances(header, frame, options, notes)
+        spacing = _spacing(header, frame, options, notes)
+        _check_tilt(header, frame, options, notes)
+        rotation = _rotation(header, frame, notes)
+        carm = CArm(
+            primary_angle_deg=primary,
+            secondary_angle_deg=secondary,
+            detector_rotation_deg=float(rotation),
+            sod_mm=sod,
+            sdd_mm=sdd,
+            rows=header.rows,
+            columns=header.columns,
+            pixel_spacing_mm=spacing,
+            principal_point_px=_principal_point(header, frame, spacing, rotation, notes),
+        )
+    except GeometryError as error:
+        text = str(error)
+        raise GeometryError(
+            text if text.startswith(header.name) else f"{header.name}: {text}"
+        ) from None
+    return carm, notes
+
+
+def is_flipped(header: Header, frame: int) -> bool:
+    """Whether the pixels are a mirror image of what the detector saw."""
+    return header.text("FieldOfViewHorizontalFlip", frame) == "YES"
+
+
+def _angles(header: Header, frame: int) -> tuple[float, float]:
+    found = []
+    for axis in ("Primary", "Secondary"):
+        keyword = f"Positioner{axis}Angle"
+        angle = header.number(keyword, frame)
+        if angle is None:
+            angle = header.number(f"PositionerIsocenter{axis}Angle", frame)
+        if angle is None:
+            raise GeometryError(f"{tag(keyword)} is missing; {_WAY_OUT}")
+        found.append(angle + (0.0 if header.enhanced else _increment(header, keyword, frame)))
+    # Sums of angle and increment may pass the back; the direction is the same.
+    primary = found[0] if abs(found[0]) <= 180.0 else (found[0] + 180.0) % 360.0 - 180.0
+    return primary, found[1]
+
+
+def _increment(header: Header, keyword: str, frame: int) -> float:
+    """Angle of a frame against the first (PS3.3 C.8.7.5.1.3).
+
+    One value is the change from frame to frame, as many as frames are offsets from the first.
+    """
+    if header.text("PositionerMotion") != "DYNAMIC":
+        return 0.0
+    steps = header.numbers(keyword + "Increment")
+    if steps is None and frame == 0:
+        return 0.0
+    if steps is None:
+        raise GeometryError(
+            f"the C-arm moved during the run, and {tag(keyword + 'Increment')} is missing: the "
+            f"angles of frame {frame + 1} are unknown; use --frame 1, or {_WAY_OUT}"
+        )
+    if len(steps) == 1:
+        return frame * steps[0]
+    if len(steps) != header.frames:
+        raise GeometryError(
+            f"{tag(keyword + 'Increment')} holds {len(steps)} values for {header.frames} frames"
+        )
+    return steps[frame]
+
+
+def _distances(
+    header: Header, frame: int, options: DicomOptions, notes: list[str]
+) -> tuple[float, float]:
+    sdd = header.number("DistanceSourceToDetector", frame)
+    if not sdd:
+        raise GeometryError(f"{tag('DistanceSourceToDetector')} is missing; {_WAY_OUT}")
+    factor = header.number("EstimatedRadiographicMagnificationFactor", frame)
+    sod = header.number("DistanceSourceToIsocenter", frame)
+    if not sod:
+        sod = header.number("DistanceSourceToPatient", frame)
+    if not sod and options.sod_mm is None:
+        hint = f" (its magnification factor suggests {sdd / factor:.0f})" if factor else ""
+        raise GeometryError(
+            f"{tag('DistanceSourceToPatient')}, source to isocentre, is missing; "
+            f"give it with --sod MM{hint}"
+        )
+    if sod and options.sod_mm is not None and abs(sod - options.sod_mm) > 0.5:
+        notes.append(f"says {sod:g} mm source to isocentre itself; --sod is not used for it")
+    sod = sod or float(options.sod_mm or 0.0)
+    if factor and abs(sdd / sod / factor - 1.0) > options.magnification_share:
+        notes.append(
+            f"{tag('EstimatedRadiographicMagnificationFactor')} = {factor:g} is at odds with "
+            f"SDD / SOD = {sdd / sod:.3f}: is one of the distances to something else?"
+        )
+    return sod, sdd
+
+
+def _spacing(
+    header: Header, frame: int, options: DicomOptions, notes: list[str]
+) -> tuple[float, float]:
+    own, given = header.pair("ImagerPixelSpacing", frame), options.pixel_spacing_mm
+    if own is None and given is None:
+        calibrated = header.find("PixelSpacing", frame) is not None
+        why = (
+            f"; {tag('PixelSpacing')} is a calibration in the patient and no substitute"
+            if calibrated
+            else ""
+        )
+        raise GeometryError(
+            f"{tag('ImagerPixelSpacing')}, pixel spacing at the detector, is missing; "
+            f"give it with --pixel-spacing MM{why}"
+        )
+    if own is None:
+        return float(given or 0.0), float(given or 0.0)
+    if given is not None and max(abs(x / given - 1.0) for x in own) > 1e-3:
+        notes.append(f"says {own[0]:g} mm pixel spacing itself; --pixel-spacing is not used for it")
+    return own
+
+
+def _check_tilt(header: Header, frame: int, options: DicomOptions, notes: list[str]) -> None:
+    for keyword in ("DetectorPrimaryAngle", "DetectorSecondaryAngle"):
+        tilt = header.number(keyword, frame) or 0.0
+        if abs(tilt) > options.max_tilt_deg:
+            raise GeometryError(
+                f"{tag(keyword)} = {tilt:g} deg: the detector is tilted against the beam "
+                f"(at most {options.max_tilt_deg:g} deg); {_WAY_OUT} and a projection_matrix"
+            )
+        if abs(tilt) > options.good_tilt_deg:
+            notes.append(f"{tag(keyword)} = {tilt:g} deg is neglected")
+
+
+def _rotation(header: Header, frame: int, notes: list[str]) -> int:
+    """Clockwise turn of the stored picture against the detector: 0, 90, 180 or 270 deg."""
+    turned = header.number("FieldOfViewRotation", frame) or 0.0
+    if turned not in (0.0, 90.0, 180.0, 270.0):
+        raise GeometryError(
+            f"{tag('FieldOfViewRotation')} = {turned:g} deg must be 0, 90, 180 or 270"
+        )
+    if turned:
+        # Content turned clockwise: the axes turn counter-clockwise, as detector_rotation_deg does.
+        notes.append(f"the picture is taken as turned by {turned:g} deg against the detector")
+    if is_flipped(header, frame):
+        notes.append("the picture is stored as a mirror image; it was turned back")
+    own = header.number("PositionerIsocenterDetectorRotationAngle", frame) or 0.0
+    if own:
+        notes.append(
+            f"{tag('PositionerIsocenterDetectorRotationAngle')} = {own:g} deg is not applied"
+        )
+    return int(turned)
+
+
+def _principal_point(
+    header: Header, frame: int, spacing: tuple[float, float], rotation: int, notes: list[str]
+) -> tuple[float, float] | None:
+    """(col, row) of the isocentre in the picture, flip undone; None for the picture's middle.
+
+    ``PositionOfIsocenterProjection`` and ``FieldOfViewOrigin`` count detector elements (row,
+    column) from the detector's first corner, before the picture was turned or flipped.
+    """
+    center = header.pair("PositionOfIsocenterProjection", frame)
+    origin = header.pair("FieldOfViewOrigin", frame)
+    element = header.pair("DetectorElementSpacing", frame)
+    if center is None and (origin is None or origin == (0.0, 0.0)):
+        return None
+    if center is None and element is not None:
+        size = header.pair("PhysicalDetectorSize", frame)
+        size = size or header.pair("DetectorActiveDimensions", frame)
+        if size is not None:
+            center = ((size[0] / element[0] - 1) / 2, (size[1] / element[1] - 1) / 2)
+    if center is None or element is None or min(element) <= 0:
+        notes.append(
+            f"{tag('FieldOfViewOrigin')} or {tag('PositionOfIsocenterProjection')} is given, but "
+            "not the detector that it counts on: the isocentre is taken to project into the "
+            "picture's middle"
+        )
+        return None
+    turned = rotation in (90, 270)
+    rows, columns = (header.columns, header.rows) if turned else (header.rows, header.columns)
+    own = spacing[::-1] if turned else spacing
+    origin = origin or (0.0, 0.0)
+    row, col = ((center[k] - origin[k] + 0.5) * element[k] / own[k] - 0.5 for k in range(2))
+    if rotation == 90:
+        row, col = col, rows - 1 - row
+    elif rotation == 180:
+        row, col = rows - 1 - row, columns - 1 - col
+    elif rotation == 270:
+        row, col = columns - 1 - col, row
+    if not all(math.isfinite(x) for x in (row, col)):
+        raise GeometryError(f"{tag('PositionOfIsocenterProjection')} is not finite")
+    return col, row

@@ -1,0 +1,56 @@
+"""Read a whole file once, with a limit: no pipe is waited for, no device is read."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+
+def read_bounded(path: str | Path, max_bytes: int) -> bytes:
+    """Return the bytes of a regular file that is not empty.
+
+    Parameters
+    ----------
+    path : str or Path
+    max_bytes : int
+        A larger file is refused before it is read.
+
+    Raises
+    ------
+    ValueError
+        The end of a sentence that the caller begins with the file's name.
+    """
+    try:
+        # O_NONBLOCK: a named pipe must be refused, not waited for.
+        handle = os.open(
+            path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        )
+    except FileNotFoundError:
+        raise ValueError("no such file; check the path") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "invalid path"
+        raise ValueError(f"cannot be opened ({reason}); check the path") from None
+    try:
+        # before fdopen, which takes no folders
+        info = os.fstat(handle)
+        if not stat.S_ISREG(info.st_mode):
+            raise ValueError("is not a regular file; give the file itself")
+        stream = os.fdopen(handle, "rb")
+    except ValueError:
+        os.close(handle)
+        raise
+    with stream:
+        data = stream.read(max_bytes + 1) if info.st_size <= max_bytes else b""
+    if info.st_size > max_bytes or len(data) > max_bytes:
+        raise ValueError(
+            f"is larger than the {_size(max_bytes)} that are read "
+            f"({_size(max(info.st_size, len(data)))})"
+        )
+    if not data:
+        raise ValueError("is empty; copy or export it again")
+    return data
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**20:.4g} MiB" if count >= 2**20 else f"{count / 2**10:.4g} KiB"

@@ -1,0 +1,307 @@
+"""HTTP face of the worker: JSON on the loopback interface, behind a token.
+
+Flask and waitress (extra ``serve``): the handlers are as synchronous as the engine; waitress
+receives a whole request, within its limits of size and time, before a thread sees it.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import shutil
+import threading
+from http import HTTPStatus
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from flask import Flask, Response, jsonify, request, send_from_directory, url_for
+from werkzeug.datastructures import FileStorage
+from werkzeug.exceptions import HTTPException
+
+from gcar_deploy import __version__
+from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.output.result import RESEARCH_USE
+from gcar_deploy.worker.folder import AllowedFolder
+from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
+from gcar_deploy.worker.orders import (
+    KEYS,
+    MOST_VIEWS,
+    Order,
+    check_keys,
+    common_fields,
+    new_scratch,
+    parse_order,
+    suffix_of,
+)
+
+_log = logging.getLogger(__name__)
+LOOPBACK = "127.0.0.1"
+#: names by which a browser's page under someone else's name cannot call the worker
+_HOSTS = ["127.0.0.1", "localhost"]
+#: answered without a token: nothing in them is anybody's
+_OPEN = ("/health", "/openapi.json")
+#: the longest that a request waits for its job, seconds
+MOST_WAIT_S = 60.0
+#: geometry and options of one request, bytes
+_MOST_FIELDS = 4 * 2**20
+#: threads of the server; half of them may wait for jobs
+THREADS = 8
+_STATUS_OF = {2: 400, 3: 422, 4: 422, 5: 500, 6: 422, 7: 503, 8: 500}
+
+
+def create_app(
+    queue: JobQueue, token: str, *, folder: AllowedFolder | None = None, body_mib: int = 256
+) -> Flask:
+    """Make the WSGI application.
+
+    Parameters
+    ----------
+    queue : does the work
+    token : every request but ``/health`` and ``/openapi.json`` must bear it
+    folder : where orders may name files; None takes uploads alone
+    body_mib : the largest request
+    """
+    app = Flask("gcar", static_folder=None)
+    app.config.update(
+        MAX_CONTENT_LENGTH=body_mib * 2**20,
+        MAX_FORM_MEMORY_SIZE=_MOST_FIELDS,
+        MAX_FORM_PARTS=MOST_VIEWS + len(KEYS) + 2,
+        TRUSTED_HOSTS=_HOSTS,
+    )
+    app.json.sort_keys = False  # type: ignore[attr-defined]
+    waiters = threading.BoundedSemaphore(THREADS // 2)
+    _guard(app, token)
+    _errors(app)
+
+    @app.get("/health")
+    def health() -> Any:
+        return {"status": "ok", "version": __version__, "jobs": queue.counts(), "use": RESEARCH_USE}
+
+    @app.get("/openapi.json")
+    def openapi() -> Response:
+        text = resources.files("gcar_deploy.worker").joinpath("openapi.json").read_text("utf-8")
+        return Response(text.replace("__VERSION__", __version__), mimetype="application/json")
+
+    @app.post("/v1/reconstruct")
+    def reconstruct() -> Any:
+        order = _order(folder)
+        try:
+            job = queue.submit(order)
+        except QueueFullError:
+            if order.scratch is not None:
+                shutil.rmtree(order.scratch, ignore_errors=True)
+            raise
+        _wait(job, waiters)
+        place = url_for("job_of", job_id=job.id)
+        return _shown(job, queue), HTTPStatus.ACCEPTED if job.open else 200, {"Location": place}
+
+    @app.get("/v1/jobs/<job_id>")
+    def job_of(job_id: str) -> Any:
+        job = _found(queue, job_id)
+        _wait(job, waiters)
+        return _shown(job, queue)
+
+    @app.delete("/v1/jobs/<job_id>")
+    def cancel(job_id: str) -> Any:
+        job = _found(queue, job_id)
+        if job.open:
+            queue.cancel(job)
+            return _shown(job, queue), HTTPStatus.ACCEPTED
+        queue.forget(job)
+        return "", HTTPStatus.NO_CONTENT
+
+    @app.get("/v1/jobs/<job_id>/files/<name>")
+    def file_of(job_id: str, name: str) -> Any:
+        job = _found(queue, job_id)
+        if job.state != DONE or job.folder is None or name not in _files(job):
+            return _error(f"job {job_id} has no file {name!r}", 2, HTTPStatus.NOT_FOUND)
+        return send_from_directory(job.folder, name, max_age=0)
+
+    return app
+
+
+def _guard(app: Flask, token: str) -> None:
+    expected = f"Bearer {token}".encode()
+
+    @app.before_request
+    def check() -> Any:
+        # Pages in a browser have no business here, whatever name they reached us by.
+        if "Origin" in request.headers:
+            return _error("requests of web pages are not answered", 2, HTTPStatus.FORBIDDEN)
+        if request.host.rpartition(":")[0] not in _HOSTS and request.host not in _HOSTS:
+            return _error("unknown Host", 2, HTTPStatus.MISDIRECTED_REQUEST)
+        given = request.headers.get("Authorization", "").encode()
+        if request.path not in _OPEN and not hmac.compare_digest(given, expected):
+            answer = _error("Authorization: Bearer TOKEN is missing or wrong", 2, 401)
+            answer.headers["WWW-Authenticate"] = "Bearer"
+            return answer
+        return None
+
+    @app.after_request
+    def quiet(answer: Response) -> Response:
+        answer.headers["Cache-Control"] = "no-store"
+        answer.headers["X-Content-Type-Options"] = "nosniff"
+        return answer
+
+
+def _errors(app: Flask) -> None:
+    @app.errorhandler(GcarError)
+    def of_gcar(error: GcarError) -> Response:
+        return _error(str(error), error.exit_code, _STATUS_OF.get(error.exit_code, 500))
+
+    @app.errorhandler(HTTPException)
+    def of_http(error: HTTPException) -> Response:
+        return _error(f"{error.name}: {error.description}", 2, error.code or 500)
+
+    @app.errorhandler(Exception)
+    def of_bug(error: Exception) -> Response:
+        _log.exception("internal error")
+        return _error(f"internal error: {type(error).__name__}", 1, 500)
+
+
+def _error(message: str, exit_code: int, status: int) -> Response:
+    answer = jsonify(error={"message": " ".join(message.split()), "exit_code": exit_code})
+    answer.status_code = int(status)
+    if status == HTTPStatus.SERVICE_UNAVAILABLE:
+        answer.headers["Retry-After"] = "2"
+    return answer
+
+
+def _found(queue: JobQueue, job_id: str) -> Job:
+    job = queue.get(job_id)
+    if job is None:
+        from werkzeug.exceptions import NotFound
+
+        raise NotFound("no such job; finished jobs are forgotten after a while")
+    return job
+
+
+def _wait(job: Job, waiters: threading.BoundedSemaphore) -> None:
+    """Wait for the job as long as ``?wait=SECONDS`` asks, if a thread can be spared."""
+    text = request.args.get("wait", "0")
+    try:
+        seconds = float(text)
+        if not 0 <= seconds <= MOST_WAIT_S:
+            raise ValueError
+    except ValueError:
+        raise UsageError(f"wait = {text!r} must be 0 .. {MOST_WAIT_S:g} seconds") from None
+    if seconds and job.open and waiters.acquire(blocking=False):
+        try:
+            job.finished.wait(seconds)
+        finally:
+            waiters.release()
+
+
+def _shown(job: Job, queue: JobQueue) -> dict[str, Any]:
+    return {
+        "id": job.id,
+        "state": job.state,
+        "stage": job.stage,
+        "share": round(job.share, 4),
+        "ahead": queue.ahead(job),
+        "seconds": job.seconds,
+        "error": None if job.error is None else {"message": job.error, "exit_code": job.exit_code},
+        "out": None if job.order.out is None else str(job.order.out),
+        "files": _files(job),
+        "result": job.summary,
+    }
+
+
+def _files(job: Job) -> list[str]:
+    if job.state != DONE or job.folder is None or not job.folder.is_dir():
+        return []
+    return sorted(path.name for path in job.folder.iterdir() if path.is_file())
+
+
+def _order(folder: AllowedFolder | None) -> Order:
+    if request.mimetype == "application/json":
+        values = request.get_json()
+        if folder is None:
+            raise UsageError("this worker takes uploads alone: it was started without --folder")
+        return parse_order(values, folder)
+    if request.mimetype == "multipart/form-data":
+        return _uploaded(folder)
+    raise UsageError("send multipart/form-data or application/json")
+
+
+def _uploaded(folder: AllowedFolder | None) -> Order:
+    """Read an order of parts ``view`` (in order), and at will ``geometry`` and ``options``."""
+    files: list[FileStorage] = request.files.getlist("view")
+    unknown = (set(request.files) | set(request.form)) - {"view", "geometry", "options"}
+    if unknown:
+        raise UsageError(f"unknown part {sorted(unknown)[0]!r}; known: view, geometry, options")
+    if not 2 <= len(files) <= MOST_VIEWS:
+        raise UsageError(f"{len(files)} parts named view; 2 .. {MOST_VIEWS} are taken")
+    options = check_keys(_json("options", "{}"))
+    if "views" in options or "geometry" in options:
+        raise UsageError("options: views and geometry are parts of their own")
+    # Only DICOM views may do without; the engine says so.
+    geometry = _json("geometry", "null")
+    if not isinstance(geometry, (dict, type(None))):
+        raise UsageError("part geometry must be the content of a geom.json")
+    if options.get("out") is not None and folder is None:
+        raise UsageError("out needs a worker that was started with --folder")
+    common = common_fields(options, folder)
+    scratch = new_scratch()
+    try:
+        views = []
+        for number, file in enumerate(files, start=1):
+            path: Path = scratch / f"view{number}{suffix_of(file.filename or '')}"
+            file.save(path)
+            views.append(path)
+    except BaseException:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+    return Order(views=tuple(views), geometry=geometry, scratch=scratch, **common)
+
+
+def _json(part: str, default: str) -> Any:
+    """JSON of a form field, or of a small file of that name."""
+    text = request.form.get(part, default)
+    if part in request.files:
+        data = request.files[part].stream.read(_MOST_FIELDS + 1)
+        if len(data) > _MOST_FIELDS:
+            raise UsageError(f"part {part}: larger than {_MOST_FIELDS >> 20} MiB")
+        text = data.decode("utf-8", "replace")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        raise UsageError(f"part {part} is not JSON") from None
+
+
+def listen(app: Flask, port: int) -> Any:
+    """Bind the loopback interface.
+
+    Parameters
+    ----------
+    port : 0 takes a free one; ``server.effective_port`` tells which
+
+    Returns
+    -------
+    waitress server; ``run()`` serves until interrupted, ``close()`` frees the port
+
+    Raises
+    ------
+    UsageError
+        The port is taken.
+    """
+    from waitress import create_server
+
+    try:
+        return create_server(
+            app,
+            host=LOOPBACK,
+            port=port,
+            threads=THREADS,
+            ident="gcar",
+            max_request_body_size=app.config["MAX_CONTENT_LENGTH"],
+            max_request_header_size=32 * 2**10,
+            channel_timeout=30,
+            cleanup_interval=5,
+            connection_limit=64,
+            clear_untrusted_proxy_headers=True,
+        )
+    except OSError as error:
+        raise UsageError(f"port {port} cannot be used ({error.strerror})") from None

@@ -1,0 +1,153 @@
+"""JSON lines on standard input and output: JSON-RPC 2.0, one message a line.
+
+Methods: ``reconstruct`` (params as ``orders.parse_order``; answered when finished),
+``cancel`` ({"id": id of the request}), ``health``, ``shutdown``. Notifications: ``progress``
+({"id", "stage", "share"}). Error codes above 0 are the exit codes of ``gcar run``.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from typing import IO, Any
+
+from gcar_deploy import __version__
+from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.output.result import RESEARCH_USE
+from gcar_deploy.worker.folder import AllowedFolder
+from gcar_deploy.worker.jobs import DONE, Job, JobQueue
+from gcar_deploy.worker.orders import parse_order
+
+#: characters of one message
+MOST_CHARACTERS = 4 * 2**20
+PARSE_ERROR, INVALID_REQUEST, UNKNOWN_METHOD, INVALID_PARAMS = -32700, -32600, -32601, -32602
+
+
+class LineServer:
+    """Serves one host through two text streams.
+
+    Parameters
+    ----------
+    make_queue : called with ``on_change``; returns the JobQueue
+    folder : every file must lie in it; None leaves the paths to the host
+    source, sink : text streams
+    """
+
+    def __init__(
+        self,
+        make_queue: Callable[[Callable[[Job], None]], JobQueue],
+        folder: AllowedFolder | None,
+        source: IO[str],
+        sink: IO[str],
+    ) -> None:
+        self._source, self._sink, self._folder = source, sink, folder
+        self._writing = threading.Lock()
+        self._asking = threading.Lock()
+        self._request_of: dict[str, Any] = {}
+        self._queue = make_queue(self._changed)
+
+    def run(self) -> None:
+        """Serve until the input ends or ``shutdown`` comes; open jobs are cancelled then."""
+        try:
+            while line := self._source.readline(MOST_CHARACTERS):
+                if len(line) >= MOST_CHARACTERS and not line.endswith("\n"):
+                    self._fail(None, INVALID_REQUEST, "the message is too long")
+                    return
+                if line.strip() and not self._take(line):
+                    return
+        finally:
+            self._queue.close()
+
+    def _take(self, line: str) -> bool:
+        """Answer one line; False ends the service."""
+        try:
+            message = json.loads(line)
+        except (ValueError, RecursionError):
+            self._fail(None, PARSE_ERROR, "not JSON")
+            return True
+        ident = message.get("id") if isinstance(message, dict) else None
+        if not (
+            isinstance(message, dict)
+            and message.get("jsonrpc") == "2.0"
+            and isinstance(message.get("method"), str)
+            and isinstance(ident, (str, int))
+        ):
+            self._fail(None, INVALID_REQUEST, "not a JSON-RPC 2.0 request with an id")
+            return True
+        method, params = message["method"], message.get("params", {})
+        try:
+            if method == "reconstruct":
+                self._reconstruct(ident, params)
+            elif method == "cancel":
+                self._answer(ident, {"cancelled": self._cancel(params)})
+            elif method == "health":
+                self._answer(
+                    ident,
+                    {"status": "ok", "version": __version__, "jobs": self._queue.counts(),
+                     "use": RESEARCH_USE},
+                )  # fmt: skip
+            elif method == "shutdown":
+                self._answer(ident, None)
+                return False
+            else:
+                self._fail(ident, UNKNOWN_METHOD, f"unknown method {method[:80]!r}")
+        except UsageError as error:
+            self._fail(ident, INVALID_PARAMS, str(error))
+        except GcarError as error:
+            self._fail(ident, error.exit_code, str(error))
+        return True
+
+    def _reconstruct(self, ident: Any, params: Any) -> None:
+        order = parse_order(params, self._folder)
+        if order.out is None:
+            raise UsageError("out is missing: name the folder for the result")
+        # The job may be over before submit returns.
+        with self._asking:
+            if ident in self._request_of.values():
+                raise UsageError(f"id {ident!r} is in use")
+            self._request_of[self._queue.submit(order).id] = ident
+
+    def _cancel(self, params: Any) -> bool:
+        wanted = params.get("id") if isinstance(params, dict) else None
+        with self._asking:
+            found = [job for job, ident in self._request_of.items() if ident == wanted]
+        job = self._queue.get(found[0]) if found else None
+        if job is None or not job.open:
+            return False
+        self._queue.cancel(job)
+        return True
+
+    def _changed(self, job: Job) -> None:
+        with self._asking:
+            ident = self._request_of.get(job.id)
+            if not job.open:
+                self._request_of.pop(job.id, None)
+        if ident is None:
+            return
+        if job.open:
+            params = {"id": ident, "stage": job.stage, "share": round(job.share, 4)}
+            self._write({"jsonrpc": "2.0", "method": "progress", "params": params})
+        elif job.state == DONE:
+            self._answer(ident, {"out": str(job.folder), "result": job.summary})
+        else:
+            self._fail(ident, job.exit_code or 1, job.error or job.state, {"state": job.state})
+
+    def _answer(self, ident: Any, result: Any) -> None:
+        self._write({"jsonrpc": "2.0", "id": ident, "result": result})
+
+    def _fail(self, ident: Any, code: int, message: str, data: Any = None) -> None:
+        error = {"code": code, "message": " ".join(message.split())}
+        if data is not None:
+            error["data"] = data
+        self._write({"jsonrpc": "2.0", "id": ident, "error": error})
+
+    def _write(self, message: dict[str, Any]) -> None:
+        text = json.dumps(message, allow_nan=False)
+        with self._writing:
+            try:
+                self._sink.write(text + "\n")
+                self._sink.flush()
+            except (BrokenPipeError, ValueError):
+                # The host is gone; the end of the input tells the rest.
+                return

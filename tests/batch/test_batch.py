@@ -1,0 +1,217 @@
+"""Many cases: broken ones are rows, interrupted runs go on, a dead process names its case."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import html.parser
+import json
+import os
+import signal
+
+import pytest
+
+from gcar_deploy.batch import pools, work
+from gcar_deploy.batch.batch import run_batch
+from gcar_deploy.batch.cases import read_cases
+from gcar_deploy.batch.summary import summary_csv, summary_html
+from gcar_deploy.errors import UsageError
+from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
+
+OPTIONS = {"predictor": "none", "refiner": "tube", "model": None, "threads": 1, "deadline_s": None}
+
+
+@pytest.fixture
+def table(good_case, tmp_path):  # noqa: F811 - the imported fixture
+    """Six cases: two good, one picture twice, one picture missing, broken geometry, blank."""
+    geometry = json.loads((good_case / "geom.json").read_text())
+    geometry["views"][0]["sod_mm"] = 1
+    (tmp_path / "bad.json").write_text(json.dumps(geometry))
+    a, b, g = (good_case / name for name in ("view1.png", "view2.png", "geom.json"))
+    lines = [
+        "case,geom,view1,view2,view3",
+        f"good-1,{g},{a},{b},",
+        f"twice,{g},{a},{a},",
+        f"missing,{g},{a},absent.png,",
+        f"bad-geometry,bad.json,{a},{b},",
+        f"three,{g},{a},{b},{b}",
+        f"good-2,{g},{a},{b},",
+    ]
+    path = tmp_path / "cases.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
+    return path
+
+
+@pytest.mark.slow
+def test_broken_cases_are_rows_and_the_rest_is_done(table, tmp_path):
+    out = tmp_path / "out"
+    done = gcar("batch", table, "--out", out, "--predictor", "none", "--jobs", 2)
+    assert done.code == 0, done.err
+    rows = {row["case"]: row for row in csv.DictReader((out / "summary.csv").open())}
+    assert list(rows) == ["good-1", "twice", "missing", "bad-geometry", "three", "good-2"]
+    codes = {name: int(row["exit_code"]) for name, row in rows.items()}
+    assert codes == {
+        "good-1": 0, "twice": 6, "missing": 3, "bad-geometry": 4, "three": 4, "good-2": 0,
+    }  # fmt: skip
+    assert rows["missing"]["status"] == "failed" and "absent.png" in rows["missing"]["sentence"]
+    assert (out / "good-1" / "report.html").is_file() and not (out / "twice").exists()
+    assert not list((out / "rows").glob("*.running"))
+    assert "4 failed" not in done.out and "3 failed" in done.out and "1 refused" in done.out
+
+
+def rows_without_processes(monkeypatch, kill=()):
+    """Cases run in this process; the names of those that ran."""
+    ran = []
+
+    def here(jobs, processes):
+        for job in jobs:
+            if job.case in kill:
+                raise KeyboardInterrupt
+            ran.append(job.case)
+            yield work.run_case(job)
+
+    monkeypatch.setattr("gcar_deploy.batch.batch.in_processes", here)
+    return ran
+
+
+@pytest.mark.slow
+def test_an_interrupted_batch_goes_on(table, tmp_path, monkeypatch):
+    cases, out = read_cases(table), tmp_path / "out"
+    first = rows_without_processes(monkeypatch, kill=("missing",))
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(cases, out, OPTIONS)
+    assert first == ["good-1", "twice"] and not (out / "summary.csv").exists()
+    second = rows_without_processes(monkeypatch)
+    told = []
+    rows = run_batch(cases, out, OPTIONS, on_case=lambda *what: told.append(what[:2]))
+    assert second == ["missing", "bad-geometry", "three", "good-2"]
+    assert told == [(2, 6), (3, 6), (4, 6), (5, 6), (6, 6)]
+    assert [row["case"] for row in rows] == [case.name for case in cases]
+    third = rows_without_processes(monkeypatch)
+    assert run_batch(cases, out, OPTIONS) == rows and third == []
+    again = rows_without_processes(monkeypatch)
+    run_batch(cases, out, OPTIONS, force=True)
+    assert again == ["missing", "bad-geometry", "three"]
+
+
+def test_a_changed_case_is_not_passed_off_as_the_old_one(table, tmp_path, monkeypatch):
+    rows_without_processes(monkeypatch)
+    cases = [case for case in read_cases(table) if case.name in ("twice", "bad-geometry")]
+    run_batch(cases, tmp_path / "out", OPTIONS)
+    with pytest.raises(UsageError, match=r"'twice'.*--force"):
+        run_batch(cases, tmp_path / "out", {**OPTIONS, "refiner": "none"})
+    (tmp_path / "bad.json").write_text("{}")
+    with pytest.raises(UsageError, match="bad-geometry"):
+        run_batch(cases, tmp_path / "out", OPTIONS)
+
+
+def suicidal(job):
+    """Stands for a case that crashes a library: the process is gone without a word."""
+    marker = job.marker
+    open(marker, "w").close()
+    if job.case == "killer":
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.unlink(marker)
+    return {**work.error_row(job.case, "ok", "", 0), "fingerprint": job.fingerprint}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
+    monkeypatch.setattr(pools, "run_case", suicidal)
+    jobs = [
+        work.BatchJob(
+            case=name, views=(), geometry="", out="", marker=str(tmp_path / name),
+            fingerprint="f", predictor="none", refiner="tube", model=None, threads=None,
+            deadline_s=None,
+        )
+        for name in ("a", "killer", "b", "c")
+    ]  # fmt: skip
+    rows = {row["case"]: row for row in pools.in_processes(jobs, 2)}
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "a": "ok", "killer": "failed", "b": "ok", "c": "ok",
+    }  # fmt: skip
+    assert "died" in rows["killer"]["sentence"]
+
+
+@pytest.mark.slow
+def test_on_a_dask_cluster(table, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    cases = [case for case in read_cases(table) if case.name in ("good-1", "missing")]
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
+        dashboard_address=None, worker_dashboard_address=None,
+    ) as cluster:  # fmt: skip
+        rows = run_batch(cases, tmp_path / "out", OPTIONS, scheduler=cluster.scheduler_address)
+    assert [row["exit_code"] for row in rows] == [0, 3]
+    assert (tmp_path / "out" / "good-1" / "result.json").is_file()
+
+
+def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(pools, "CONNECT_S", 0.2)
+    with pytest.raises(UsageError, match="does not answer"):
+        run_batch(read_cases(table), tmp_path / "o", OPTIONS, scheduler="tcp://127.0.0.1:9")
+    done = gcar("batch", table, "--out", tmp_path / "p", "--engine", "dask")
+    assert done.code == 2 and "--scheduler" in done.err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "'case' is missing"),
+        ("case,geom,view1\na,g,1\n", "'view1' and 'view2'"),
+        ("case,geom,view1,view2\n", "0 cases"),
+        ("case,geom,view1,view2,extra\na,g,1,2,3\n", "unknown column 'extra'"),
+        ("case,geom,view1,view2\na,g,1,2,3\n", "more fields"),
+        ("case,geom,view1,view2\n../a,g,1,2\n", "line 2: case '../a'"),
+        ("case,geom,view1,view2\nrows,g,1,2\n", "'rows'"),
+        ("case,geom,view1,view2\na,g,1,2\nA,g,1,2\n", "line 3: case 'A' stands there twice"),
+        ("case,geom,view1,view2\na,g,1,\n", "two or more views"),
+        ("case,geom,view1,view2,view3\na,g,1,,3\n", "without a gap"),
+    ],
+)
+def test_tables_that_are_refused(tmp_path, text, words):
+    path = tmp_path / "cases.csv"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=r"cases\.csv") as caught:
+        read_cases(path)
+    assert words in str(caught.value)
+
+
+def test_nothing_of_the_users_is_touched(table, tmp_path):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "thesis.txt").write_text("x")
+    with pytest.raises(UsageError, match="holds no batch"):
+        run_batch(read_cases(table), out, OPTIONS)
+    assert [p.name for p in out.iterdir()] == ["thesis.txt"]
+
+
+def test_the_summary_page_fetches_nothing_and_runs_nothing():
+    rows = [
+        {**work.error_row("a", "ok", "fine", 0), "length_mm": 12.5},
+        work.error_row("b", "failed", "<script>alert(1)</script>", 1),
+    ]
+    page = summary_html(rows)
+    tags = []
+
+    class Reader(html.parser.HTMLParser):
+        def handle_starttag(self, tag, attrs):
+            tags.append((tag, dict(attrs)))
+
+    Reader().feed(page)
+    assert not any(tag in ("script", "img", "link", "iframe") for tag, _ in tags)
+    assert [a["href"] for tag, a in tags if tag == "a"] == ["a/report.html"]
+    assert "12.5 mm" in page and "1 failed, 1 ok" in page
+    assert summary_csv(rows).splitlines()[1].startswith("a,ok,0,fine,")
+
+
+def test_rows_travel_between_processes():
+    import pickle
+
+    job = work.BatchJob(
+        case="a", views=("v",), geometry="g", out="o", marker=None, fingerprint="f",
+        predictor="none", refiner="tube", model=None, threads=1, deadline_s=None,
+    )  # fmt: skip
+    assert dataclasses.asdict(pickle.loads(pickle.dumps(job))) == dataclasses.asdict(job)  # noqa: S301

@@ -1,0 +1,144 @@
+"""JSON lines: one message a line, answers with the ids of their questions."""
+
+from __future__ import annotations
+
+import json
+import queue
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from gcar_deploy.worker.folder import AllowedFolder
+from gcar_deploy.worker.stdio import LineServer
+
+
+class Pipe:
+    """A text stream that blocks on reading until something was written or it was closed."""
+
+    def __init__(self):
+        self._lines = queue.Queue()
+
+    def write(self, text):
+        for line in text.splitlines(keepends=True):
+            self._lines.put(line)
+
+    def flush(self):
+        pass
+
+    def close(self):
+        self._lines.put("")
+
+    def readline(self, _=-1):
+        return self._lines.get(timeout=120)
+
+
+class Host:
+    def __init__(self, make_queue, folder=None):
+        self.to, self.back = Pipe(), Pipe()
+        server = LineServer(lambda tell: make_queue(on_change=tell), folder, self.to, self.back)
+        self.thread = threading.Thread(target=server.run, daemon=True)
+        self.thread.start()
+        self.seen = []
+
+    def send(self, ident, method, **params):
+        message = {"jsonrpc": "2.0", "id": ident, "method": method, "params": params}
+        self.to.write(json.dumps(message) + "\n")
+
+    def answer(self, ident):
+        while True:
+            message = json.loads(self.back.readline())
+            self.seen.append(message)
+            if message.get("id") == ident and "method" not in message:
+                return message
+
+    def end(self):
+        self.to.close()
+        self.thread.join(60)
+        assert not self.thread.is_alive()
+
+
+def order(case, out):
+    return {
+        "views": [str(case / "view1.png"), str(case / "view2.png")],
+        "geometry": str(case / "geom.json"),
+        "out": str(out),
+    }
+
+
+def test_a_reconstruction_with_progress(make_queue, case_folder, tmp_path):
+    host = Host(make_queue)
+    host.send(7, "reconstruct", **order(case_folder, tmp_path / "out"))
+    found = host.answer(7)["result"]
+    assert found["out"] == str(tmp_path / "out") and found["result"]["schema"] == "gcar-result/1"
+    assert (tmp_path / "out" / "report.html").is_file()
+    told = [m["params"] for m in host.seen if m.get("method") == "progress"]
+    assert {p["id"] for p in told} == {7} and [p["share"] for p in told] == sorted(
+        p["share"] for p in told
+    )
+    host.end()
+
+
+def test_cancel_and_health(make_queue, case_folder, tmp_path, gate):
+    gate.clear()
+    host = Host(make_queue)
+    host.send("a", "reconstruct", **order(case_folder, tmp_path / "out"))
+    host.send("b", "cancel", id="a")
+    assert host.answer("a")["error"]["code"] == 7
+    host.send("c", "cancel", id="a")
+    assert host.answer("c")["result"] == {"cancelled": False}
+    host.send("d", "health")
+    assert host.answer("d")["result"]["status"] == "ok"
+    assert not (tmp_path / "out").exists()
+    host.end()
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("{", -32700),
+        ("[]", -32600),
+        ('{"id": 1, "method": "health"}', -32600),
+        ('{"jsonrpc": "2.0", "method": "health"}', -32600),
+        ('{"jsonrpc": "2.0", "id": 1, "method": "dance"}', -32601),
+        ('{"jsonrpc": "2.0", "id": 1, "method": "reconstruct", "params": {}}', -32602),
+        ('{"jsonrpc": "2.0", "id": 1, "method": "reconstruct", "params": [1]}', -32602),
+    ],
+)
+def test_messages_that_are_not_understood(make_queue, line, code):
+    host = Host(make_queue)
+    host.to.write(line + "\n")
+    assert json.loads(host.back.readline())["error"]["code"] == code
+    host.end()
+
+
+def test_paths_are_held_to_the_folder_where_one_is_given(make_queue, case_folder, tmp_path):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    host = Host(make_queue, AllowedFolder(folder))
+    host.send(1, "reconstruct", **order(case_folder, tmp_path / "out"))
+    assert host.answer(1)["error"]["code"] == -32602
+    host.end()
+
+
+@pytest.mark.slow
+def test_as_a_process_of_its_own(case_folder, tmp_path):
+    """Nothing but messages on stdout; the end of the input ends it."""
+    lines = [
+        {"jsonrpc": "2.0", "id": 1, "method": "reconstruct",
+         "params": order(case_folder, tmp_path / "out")},
+    ]  # fmt: skip
+    worker = subprocess.Popen(
+        [sys.executable, "-m", "gcar_deploy.cli.main", "serve", "--stdio", "--predictor", "none"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert worker.stdin and worker.stdout
+    for line in lines:
+        worker.stdin.write(json.dumps(line) + "\n")
+    worker.stdin.flush()
+    while "id" not in (message := json.loads(worker.stdout.readline())):
+        assert message["method"] == "progress"
+    assert message["result"]["out"] == str(tmp_path / "out")
+    out, err = worker.communicate(timeout=120)
+    assert out == "" and err == "" and worker.returncode == 0
