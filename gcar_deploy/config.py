@@ -180,6 +180,14 @@ class DecideOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleViewOptions:
+    """How the centres that single views predict become one set (``predict/single_view.py``)."""
+
+    #: a depth that is off by so many pixel edges of the network's picture counts half
+    depth_scale_pixels: float = 8.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PredictOptions:
     """Which Gaussian centre predictor to use, and how."""
 
@@ -188,6 +196,7 @@ class PredictOptions:
     #: edge of the lattice the predictor works on: the grid's own within these bounds, mm
     min_cell_mm: float = 0.85
     max_cell_mm: float = 1.5
+    single: SingleViewOptions = dataclasses.field(default_factory=SingleViewOptions)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
