@@ -1,1 +1,1 @@
-"""Tools of the repository; not part of any package."""
+"""Tools of the project itself: command reference, battery, requirements, bill of materials."""
