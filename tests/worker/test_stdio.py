@@ -113,6 +113,7 @@ def test_messages_that_are_not_understood(make_queue, line, code):
     host.end()
 
 
+@pytest.mark.req("REQ-41")
 def test_paths_are_held_to_the_folder_where_one_is_given(make_queue, case_folder, tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
