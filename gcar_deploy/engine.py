@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -102,8 +103,10 @@ class Engine:
         views : 2 or more pictures, in the order of the geometry's views
         geometry : where they were taken from; None where DICOM headers say it
         on_progress : called with (stage, share of the work done) from the calling thread
-        deadline_s : seconds after which the refinement ends with what it has (``degraded``)
-        cancel : callable, for instance ``threading.Event().is_set``
+        deadline_s : seconds that the call may take: the refinement ends early enough with what
+            it has (``degraded``); CancelledError if there is nothing to refine by then
+        cancel : callable, for instance ``threading.Event().is_set``; also asked from another
+            thread while the model runs; ends within one step of the refinement
 
         Raises
         ------
@@ -111,6 +114,7 @@ class Engine:
         """
         if deadline_s is not None and not deadline_s > 0:
             raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
+        started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
         result = reconstruct(
             angiograms,
@@ -120,6 +124,7 @@ class Engine:
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,
+            used_s=time.perf_counter() - started,
         )
         return dataclasses.replace(result, notes=(*notes, *result.notes))
 
