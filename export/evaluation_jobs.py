@@ -94,7 +94,8 @@ def run_job(job: Job, settings: MethodSettings) -> Done:
         "reasons": {name: m.reason for name, m in found.items() if m.reason is not None},
         "gaussians": solved.gaussians,
         "seconds": float(solved.seconds["total"]),
-        "stages": {stage: float(s) for stage, s in solved.seconds.items()},
+        "cpu_seconds": float(solved.seconds["cpu"]),
+        "stages": {s: float(t) for s, t in solved.seconds.items() if s not in ("total", "cpu")},
         "settings": job.digest,
     }
     finite = solved.volume is not None and bool(np.isfinite(solved.volume).all())

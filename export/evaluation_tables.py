@@ -38,6 +38,7 @@ MEASURES: Mapping[str, Column] = {
 COUNTS: Mapping[str, Column] = {
     "gaussians": Column("Gaussians", digits=0, factor=1.0, better=0),
     "seconds": Column("s", factor=1.0, better=-1),
+    "cpu_seconds": Column("CPU s", factor=1.0, better=-1),
 }
 _NAMES = ("protocol", "dataset", "case", "method", "views", "status", "sentence")
 #: p below -> stars, as in the paper's figures.
@@ -46,7 +47,7 @@ STARS = ((0.0001, "****"), (0.001, "***"), (0.01, "**"), (0.05, "*"))
 
 def case_rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """One line per case, method and number of views; undefined is empty, with its reason."""
-    stages = sorted({stage for row in rows for stage in row["stages"]} - {"total"})
+    stages = sorted({stage for row in rows for stage in row["stages"]})
     head = [*_NAMES, *MEASURES]
     head += ["best_threshold", *COUNTS, *(f"seconds_{stage}" for stage in stages), "undefined"]
     out = io.StringIO()
@@ -230,7 +231,7 @@ def mean_sd(entry: Mapping[str, Any], column: Column, cases: int) -> str:
 
 
 def _value(row: Mapping[str, Any], name: str) -> float | None:
-    value = row[name] if name in COUNTS else row["measures"].get(name)
+    value = row.get(name) if name in COUNTS else row["measures"].get(name)
     return None if value is None else float(value)
 
 

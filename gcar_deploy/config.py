@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TypeAlias
+
+#: (col, row) of one point in each view, None where it is not seen
+Landmark: TypeAlias = "tuple[tuple[float, float] | None, ...]"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,6 +77,12 @@ class ImagingOptions:
     """From a picture to vessel mask, skeleton and path length. Millimetres at the isocentre."""
 
     limits: PictureLimits = dataclasses.field(default_factory=PictureLimits)
+    #: who finds vessels in grey values: ``classic``, ``net``, or ``auto`` (the network is asked
+    #: where the classical method finds none)
+    segmenter: str = "classic"
+    #: hysteresis on the network's probability
+    net_low: float = 0.4
+    net_high: float = 0.7
     #: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's
     #: edge p. A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns
     #: in the sampling of the picture itself.
@@ -147,6 +157,8 @@ class PoseOptions:
     profile_noise: float = 0.05
     #: directions further apart than this are not compared: see ``estimate_poses``
     most_apart_deg: float = 150.0
+    #: how well a person marks the same point in two views, mm at the isocentre
+    landmark_sigma_mm: float = 0.5
     #: a correction must lower the disagreement to this share of what it was
     min_gain: float = 0.85
     max_evaluations: int = 40
@@ -351,6 +363,9 @@ class QualityOptions:
     #: lattice cell is not an error
     near_px: float = 2.0
     near_mm: float = 1.0
+    #: a larger estimated correction between the runs is no small matter of breath or table
+    good_shift_mm: float = 5.0
+    good_turn_deg: float = 1.5
     #: less tree than this is not a coronary tree
     min_length_mm: float = 20.0
 
@@ -368,3 +383,5 @@ class RunOptions:
     tree: TreeOptions = dataclasses.field(default_factory=TreeOptions)
     refine: RefineOptions = dataclasses.field(default_factory=RefineOptions)
     quality: QualityOptions = dataclasses.field(default_factory=QualityOptions)
+    #: points marked in the pictures, which hold the views to each other
+    landmarks: tuple[Landmark, ...] = ()

@@ -21,10 +21,12 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.center_predictor import CenterPredictor
-from gcar_deploy.predict.model_spec import read_model, shipped_model_path
+from gcar_deploy.predict.model_spec import SEGMENTER_MODEL, read_model, shipped_model_path
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
 
@@ -34,6 +36,7 @@ _log = logging.getLogger(__name__)
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
 #: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
 Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
+SEGMENTERS = ("classic", "net", "auto")
 PREDICTORS = ("auto", "multi", "single", "none")
 _DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 
@@ -67,6 +70,7 @@ class Engine:
             raise UsageError(f"threads = {threads} must be 1 or more")
         self.threads = threads or min(os.cpu_count() or 1, 4)
         self._predictor = _load(model, self.options.predict.predictor, self.threads, session)
+        self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
 
     @property
     def model(self) -> Mapping[str, str] | None:
@@ -92,6 +96,7 @@ class Engine:
         views: Sequence[Picture],
         geometry: Geometry | None = None,
         *,
+        masks: Mapping[int, str | Path | np.ndarray] | None = None,
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
         cancel: Callable[[], bool] | None = None,
@@ -102,6 +107,8 @@ class Engine:
         ----------
         views : 2 or more pictures, in the order of the geometry's views
         geometry : where they were taken from; None where DICOM headers say it
+        masks : number of the view, from 1 -> vessel mask (picture of its size), which wins over
+            what would be found in the pixels
         on_progress : called with (stage, share of the work done) from the calling thread
         deadline_s : seconds that the call may take: the refinement ends early enough with what
             it has (``degraded``); CancelledError if there is nothing to refine by then
@@ -116,11 +123,14 @@ class Engine:
             raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
         started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
+        angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
+        notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
         result = reconstruct(
             angiograms,
             grid,
             self.options,
             predictor=self._predictor,
+            segmenter=self._segmenter,
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,
@@ -190,6 +200,58 @@ def prepare(
             )
         )
     return angiograms, scene.volume_grid(), notes
+
+
+def with_masks(
+    angiograms: Sequence[Angiogram],
+    masks: Mapping[int, str | Path | np.ndarray],
+    limits: PictureLimits,
+) -> list[Angiogram]:
+    """Give pictures the user's vessel masks.
+
+    Raises
+    ------
+    UsageError
+        There is no view of that number.
+    ImageError
+        A mask cannot be read, has another size than its picture, or no vessel.
+    """
+    out = list(angiograms)
+    for number, given in masks.items():
+        if not 1 <= number <= len(out):
+            raise UsageError(f"mask {number}: there are views 1 .. {len(out)}")
+        array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
+        shape = out[number - 1].pixels.shape
+        if array.shape != shape:
+            raise ImageError(
+                f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
+            )
+        mask = array > 0.5 * float(array.max())
+        if not mask.any() or mask.mean() > 0.9:
+            raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
+        out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)
+    return out
+
+
+def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
+    """Load the network that finds vessels where ``wanted`` needs it.
+
+    Raises
+    ------
+    UsageError
+        ``wanted`` is unknown.
+    ModelError
+        ``net`` is wanted and the network is missing or altered.
+    """
+    if wanted not in SEGMENTERS:
+        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(SEGMENTERS)}")
+    path = shipped_model_path(SEGMENTER_MODEL)
+    if wanted == "classic" or (path is None and wanted == "auto"):
+        return None
+    if path is None:
+        raise ModelError("no segmentation network is installed with this version; use classic")
+    model = read_model(path, wanted=SEGMENTER_INPUT)
+    return Segmenter(model.data, model.name, threads=threads)
 
 
 def _from_headers(

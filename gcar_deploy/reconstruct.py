@@ -19,6 +19,7 @@ from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
@@ -26,6 +27,7 @@ from gcar_deploy.predict.center_predictor import CenterPredictor
 from gcar_deploy.predict.decide import decide
 from gcar_deploy.predict.encoding import encode
 from gcar_deploy.predict.thinning import thin_hull
+from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose, estimate_poses
 from gcar_deploy.refine.refine import Refined, refine, refined_volume
 from gcar_deploy.refine.tube_model import footprint, tubes_of
@@ -51,6 +53,7 @@ def reconstruct(
     options: RunOptions,
     *,
     predictor: CenterPredictor | None = None,
+    segmenter: Segmenter | None = None,
     on_progress: OnProgress | None = None,
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
@@ -64,6 +67,7 @@ def reconstruct(
     grid : Grid of the volume that is asked for
     options : RunOptions
     predictor : CenterPredictor, or None to thin the visual hull instead
+    segmenter : Segmenter, where ``options.imaging.segmenter`` asks for one
     on_progress : called with (stage, share of the work done)
     deadline_s : seconds after which the refinement ends with what it has
     cancel : called often, also from another thread; True ends the work with CancelledError
@@ -78,13 +82,17 @@ def reconstruct(
     """
     if len(angiograms) < 2:
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
+    landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
     watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
                       used_s=used_s)  # fmt: skip
     findings = quality.check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        views = _vessels(angiograms, options, report, watch)
+        views = _vessels(angiograms, options, segmenter, report, watch)
     with watch.stage("pose"):
         poses = poses_between(views, options)
+        findings += quality.check_poses(
+            views, [(p.shift_mm, p.turn_deg) for p in poses], options.quality
+        )
         findings += quality.check_consistency(
             views, [p.after for p in poses], options.quality, [p.partner for p in poses]
         )
@@ -165,13 +173,14 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
 def _vessels(
     angiograms: Sequence[Angiogram],
     options: RunOptions,
+    segmenter: Segmenter | None,
     report: Callable[[float], None],
     watch: Stopwatch,
 ) -> list[VesselImage]:
     views = []
     for angiogram in angiograms:
         watch.check()
-        views.append(extract_vessels(angiogram, options.imaging))
+        views.append(extract_vessels(angiogram, options.imaging, segmenter))
         report(len(views) / len(angiograms))
     return views
 
@@ -185,7 +194,12 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
         fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
-    return estimate_poses([sampled_path(v, options.predict.min_cell_mm) for v in views], pose)
+    small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
+    marks = landmark_pixels(options.landmarks, [view.carm for view in views])
+    for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
+        scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
+        marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
+    return estimate_poses(small, pose, marks)
 
 
 def _posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -31,7 +31,7 @@ HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", 
 #: the only files of the runtime that may name these libraries
 WALLED = {
     "torch": {"gaussians/torch_project.py"},
-    "onnxruntime": {"predict/center_predictor.py"},
+    "onnxruntime": {"predict/center_predictor.py", "imaging/net.py"},
     "nibabel": {"output/volume.py"},
     "pydicom": {"dicom/header.py", "dicom/frames.py", "output/dicom_stl.py"},
     "distributed": {"batch/pools.py"},

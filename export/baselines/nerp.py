@@ -47,14 +47,14 @@ class NerpOptions:
 
     features: int = 64
     bandwidth: float = 8.0
-    width: int = 96
+    width: int = 64
     hidden_layers: int = 3
     learning_rate: float = 3e-3
     final_rate: float = 0.1
     steps: int = 400
     patience: int = 50
     tolerance: float = 0.05
-    least_path_mm: float = 0.5
+    least_path_mm: float = 0.1
     seed: int = 0
 
 
@@ -99,21 +99,17 @@ def nerp(
 def seen_voxels(
     path_mm: Sequence[Image], carms: Sequence[CArm], grid: Grid, least_path_mm: float
 ) -> Array:
-    """(n, 3) indices of the voxels whose centre lies on a vessel pixel of every view.
+    """(n, 3) indices of the voxels at whose centre every view shows vessel.
 
-    A pixel counts with its eight neighbours, so that voxels at a vessel's rim stay.
+    Path lengths are interpolated between the pixels, so that voxels at a vessel's rim stay.
     """
-    from scipy.ndimage import binary_dilation
+    from scipy.ndimage import map_coordinates
 
     index = np.indices(grid.shape).reshape(3, -1).T
     for picture, carm in zip(path_mm, carms, strict=True):
-        wide = binary_dilation(picture >= least_path_mm, np.ones((3, 3)))
         pixels, depth = carm.project(grid.index2world(index))
-        column, row = np.rint(pixels).astype(int).T
-        seen = (depth > 0) & (row >= 0) & (row < carm.rows) & (column >= 0)
-        seen &= column < carm.columns
-        seen[seen] = wide[row[seen], column[seen]]
-        index = index[seen]
+        path = map_coordinates(picture.astype(np.float64), pixels.T[::-1], order=1)
+        index = index[(depth > 0) & (path >= least_path_mm)]
     return index
 
 

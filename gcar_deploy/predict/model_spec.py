@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from gcar_deploy.predict.onnx_guard import check_onnx
 SCHEMA = "gcar-model/1"
 #: name of the model that ``gcar run`` uses unless told otherwise
 DEFAULT_MODEL = "gcp-multi"
+#: name of the network that finds vessels in raw pictures
+SEGMENTER_MODEL = "segmenter"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,13 +52,16 @@ def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
     return path if path.is_file() else None
 
 
-def read_model(path: Path, limits: ModelLimits | None = None) -> ModelFile:
+def read_model(
+    path: Path, limits: ModelLimits | None = None, wanted: Mapping[str, Any] | None = None
+) -> ModelFile:
     """Read and verify an ONNX file and the spec beside it; nothing of the model is run.
 
     Parameters
     ----------
     path : of the ``.onnx``; its ``.json`` and, where there is one, its ``.golden.npz`` lie beside
     limits : ModelLimits, optional
+    wanted : what its spec must say of ``inputs``; by default those of the centre predictor
 
     Raises
     ------
@@ -73,7 +79,7 @@ def read_model(path: Path, limits: ModelLimits | None = None) -> ModelFile:
             f"model file {path.name} was altered: its SHA-256 starts {digest[:12]}, "
             f"its spec says {str(spec.get('sha256'))[:12]}"
         )
-    wanted = {"view_features": VIEW_FEATURES, "levels": LEVELS}
+    wanted = wanted or {"view_features": VIEW_FEATURES, "levels": LEVELS}
     inputs = spec.get("inputs", {})
     for key, value in wanted.items():
         if not isinstance(inputs, dict) or inputs.get(key) != value:

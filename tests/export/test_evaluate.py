@@ -274,6 +274,7 @@ def _row(case, method, dsc):
     return {
         "protocol": "paper", "dataset": "ImageCAS", "views": 2, "case": case, "method": method,
         "status": "ok", "sentence": "", "measures": measures, "gaussians": None, "seconds": 1.0,
+        "cpu_seconds": 2.0,
         "stages": {}, "reasons": {},
     }  # fmt: skip
 
