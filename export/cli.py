@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_export.cli_evaluate import converge, evaluate
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -23,6 +24,19 @@ class _Group(click.Group):
         except GcarError as error:
             click.echo(f"error: {error}", err=True)
             sys.exit(error.exit_code)
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            sys.exit(130)
+        except (click.ClickException, click.Abort, click.exceptions.Exit):
+            raise
+        except ImportError as error:
+            click.echo(f"error: {error.name} is missing; pip install 'gcar[export]'", err=True)
+            sys.exit(1)
+        except Exception as error:
+            logging.getLogger("gcar_export").info("internal error", exc_info=True)
+            detail = (str(error).splitlines() or [""])[0][:200]
+            click.echo(f"error: internal: {type(error).__name__} {detail}; see -v", err=True)
+            sys.exit(1)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -31,62 +45,6 @@ def main(verbose: bool) -> None:
     """Simulate, evaluate and score coronary reconstructions."""
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
-
-
-@main.command()
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
-@click.option(
-    "--protocol",
-    type=click.Choice(["paper", "clinical", "moved", "raw"]),
-    default="paper",
-    show_default=True,
-)
-@click.option(
-    "--methods",
-    default="ours,hull,hull+paper,visual_hull",
-    show_default=True,
-    help="Comma-separated; the first is the one the others are tested against.",
-)
-@click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows and tables.")
-@click.option("--jobs", default=1, show_default=True, help="Processes.")
-@click.option("--cases", default="", help="Only these cases, comma-separated.")
-@click.option("--quiet", is_flag=True, help="No progress on stderr.")
-def evaluate(
-    data: Path,
-    protocol: str,
-    methods: str,
-    views: str,
-    out: Path,
-    jobs: int,
-    cases: str,
-    quiet: bool,
-) -> None:
-    """Run methods over label volumes and print the table.
-
-    Goes on where an earlier run with the same --out stopped.
-
-    Example: gcar-export evaluate --data data --protocol clinical --methods ours,hull
-    --views 2,4 --out results
-    """
-    from gcar_export import evaluate as evaluation
-    from gcar_export import evaluation_tables
-
-    options = evaluation.EvaluateOptions(
-        data=data,
-        out=out,
-        protocol=protocol,
-        methods=_words(methods),
-        views=_numbers(views),
-        jobs=jobs,
-        cases=_words(cases),
-    )
-
-    def progress(done: int, total: int, text: str) -> None:
-        click.echo(f"[{done}/{total}] {text}", err=True)
-
-    rows = evaluation.evaluate(options, None if quiet else progress)
-    click.echo(evaluation_tables.markdown(rows, options.methods[0]))
 
 
 @main.command()
@@ -152,17 +110,6 @@ def pair_time(label: Path, repeats: int) -> None:
     stages = ", ".join(f"{name} {s:.4f}" for name, s in found.stages_s.items())
     click.echo(f"warm reconstruction {found.reconstruct_s:.4f} s ({stages})")
     click.echo(f"ratio {found.ratio:.2f} (medians of {found.repeats})")
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(word) for word in _words(text))
-    except ValueError:
-        raise UsageError(f"{text!r} is not a comma-separated list of whole numbers") from None
 
 
 @main.command()
@@ -270,3 +217,27 @@ def tree_table(data: Path | None, count: int) -> None:
     with click.progressbar(range(count), label="generated", file=sys.stderr) as seeds:
         generated = [generated_statistics(seed) for seed in seeds]
     click.echo(table(generated, [real_statistics(path) for path in real]))
+
+
+@main.command("lumen-table")
+@click.option(
+    "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
+)
+@click.option("--count", default=30, show_default=True, help="Cases, one stenosis each.")
+def lumen_table(data: Path | None, count: int) -> None:
+    """Measure stenosis, radius and branch lengths on trees with one known stenosis.
+
+    Left trees, the clinical views, stenoses of 30 .. 70 % of the diameter, 8 .. 16 mm long.
+
+    Example: gcar-export lumen-table --data data --count 27
+    """
+    from gcar_export.lumen_table import lumen_rows, table
+
+    with click.progressbar(length=count, label="cases", file=sys.stderr) as bar:
+        rows = lumen_rows(data, count, lambda: bar.update(1))
+    click.echo(table(rows))
+
+
+# Verbs with files of their own.
+for _verb in (evaluate, converge):
+    main.add_command(_verb)

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file
 
+from gcar_deploy.errors import ModelError
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES, flat_inputs, input_names
+from gcar_export.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.networks.sparse import SparseConfig, SparsePredictor
 
 OPSET = 18
@@ -35,13 +36,20 @@ class _Deployed(torch.nn.Module):
 
 
 def load_checkpoint(path: Path) -> SparsePredictor:
-    """Read ``checkpoint.safetensors`` beside its ``manifest.json``; no pickle anywhere."""
-    manifest = json.loads((path.parent / "manifest.json").read_text())
-    config = dict(manifest["config"])
-    config["width"] = tuple(config["width"])
-    net = SparsePredictor(SparseConfig(**config))
-    data = load_file(path)
-    net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
+    """Read ``checkpoint.safetensors`` beside its ``manifest.json``; no pickle anywhere.
+
+    Raises
+    ------
+    ModelError
+        Either is damaged, or they do not belong together.
+    """
+    config = dict(read_manifest(path)["config"])
+    try:
+        config["width"] = tuple(config["width"])
+        net = SparsePredictor(SparseConfig(**config))
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, ZeroDivisionError) as error:
+        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
+    filled(net, read_tensors(path), path.name)
     return net.eval()
 
 
@@ -164,7 +172,6 @@ def export_checked(checkpoint: Path, out: Path, scenes: int) -> Parity:
     ModelError
         The ONNX file says something else than the checkpoint; the file is taken away.
     """
-    from gcar_deploy.errors import ModelError
     from gcar_export.dataset import training_scene
     from gcar_export.golden import write_golden
 

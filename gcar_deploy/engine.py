@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -109,8 +110,10 @@ class Engine:
         masks : number of the view, from 1 -> vessel mask (picture of its size), which wins over
             what would be found in the pixels
         on_progress : called with (stage, share of the work done) from the calling thread
-        deadline_s : seconds after which the refinement ends with what it has (``degraded``)
-        cancel : callable, for instance ``threading.Event().is_set``
+        deadline_s : seconds that the call may take: the refinement ends early enough with what
+            it has (``degraded``); CancelledError if there is nothing to refine by then
+        cancel : callable, for instance ``threading.Event().is_set``; also asked from another
+            thread while the model runs; ends within one step of the refinement
 
         Raises
         ------
@@ -118,6 +121,7 @@ class Engine:
         """
         if deadline_s is not None and not deadline_s > 0:
             raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
+        started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
         angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
         notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
@@ -130,6 +134,7 @@ class Engine:
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,
+            used_s=time.perf_counter() - started,
         )
         return dataclasses.replace(result, notes=(*notes, *result.notes))
 

@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy import quality
+from gcar_deploy import alternatives, quality
 from gcar_deploy.config import RunOptions
-from gcar_deploy.errors import NumericalError, UsageError
+from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
@@ -41,6 +41,9 @@ STAGES = (
     ("vessels", 3.0), ("pose", 2.0), ("candidates", 1.0), ("centers", 2.0), ("refine", 6.0),
     ("tree", 1.0), ("quality", 0.5),
 )  # fmt: skip
+#: what is kept of a deadline, as shares of the time that all before the refinement took: for what
+#: follows its last step (sigma, tree, volume, quality), for its start, and for a tree without it
+FINISH_SHARE, BEGIN_SHARE, UNREFINED_SHARE = 0.9, 0.5, 0.7
 _FALLBACK = "no model was used: depth was decided by thinning the visual hull"
 
 
@@ -54,6 +57,7 @@ def reconstruct(
     on_progress: OnProgress | None = None,
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
+    used_s: float = 0.0,
 ) -> Result:
     """Reconstruct the coronary tree that all views show.
 
@@ -66,7 +70,8 @@ def reconstruct(
     segmenter : Segmenter, where ``options.imaging.segmenter`` asks for one
     on_progress : called with (stage, share of the work done)
     deadline_s : seconds after which the refinement ends with what it has
-    cancel : called often; True ends the work with CancelledError
+    cancel : called often, also from another thread; True ends the work with CancelledError
+    used_s : seconds that reading the pictures took, part of the deadline and of ``total``
 
     Raises
     ------
@@ -78,10 +83,11 @@ def reconstruct(
     if len(angiograms) < 2:
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
     landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
-    watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel)
+    watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
+                      used_s=used_s)  # fmt: skip
     findings = quality.check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        views = _vessels(angiograms, options, segmenter, report)
+        views = _vessels(angiograms, options, segmenter, report, watch)
     with watch.stage("pose"):
         poses = poses_between(views, options)
         findings += quality.check_poses(
@@ -96,22 +102,33 @@ def reconstruct(
         seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
         hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
+        watch.check()
         encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
+    told = None
     with watch.stage("centers"):
         if predictor is None:
             centers = thin_hull(hull, encoded, options.candidates)
             findings.append(_FALLBACK)
         else:
             calibrated = all(view.calibrated for view in views)
-            centers = predictor.predict(hull, encoded)
+            try:
+                stop = watch.should_stop if watch.interruptible else None
+                centers = told = predictor.predict(hull, encoded, stop)
+            except CancelledError:
+                watch.check()
+                raise
             centers = decide(centers, encoded, calibrated, options.decide)
     with watch.stage("refine") as report:
+        before_s = watch.elapsed_s
+        watch.require(UNREFINED_SHARE * before_s)
+        how = options.refine
+        if watch.left_s < (BEGIN_SHARE + FINISH_SHARE) * before_s:
+            how = dataclasses.replace(how, refiner="none")
+            findings.append("the deadline left no time to refine")
         refined = refine(
-            centers, views, options.refine, on_progress=report, should_stop=watch.should_stop,
-            tree_options=options.tree,
+            centers, views, how, on_progress=report, tree_options=options.tree,
+            should_stop=watch.leaving(FINISH_SHARE * before_s),
         )  # fmt: skip
-        if watch.cancelled:
-            watch.check()
         if refined.status == "failed":
             raise NumericalError("the refinement left the finite numbers")
         if refined.status == "stopped":
@@ -119,10 +136,17 @@ def reconstruct(
     with watch.stage("tree", keep_if_late=True):
         tree = _tree(refined, centers, options)
         quality.check_tree(tree, options.quality)
-        volume = refined_volume(refined, views, grid, options.refine)
+        if watch.cancelled:
+            watch.check()
+        volume = refined_volume(refined, views, grid, how)
     with watch.stage("quality", keep_if_late=True):
         lumen = [_lumen(tree, view, options) for view in views]
         worst = max(p.after for p in poses)
+        open_ = alternatives.exchanges(tree, [view.carm for view in views])
+        elsewhere = None if told is None else alternatives.evidence_elsewhere(
+            tree, told, encoded.ray, encoded.weight
+        )  # fmt: skip
+        findings += alternatives.findings(open_, elsewhere)
         judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
@@ -131,9 +155,9 @@ def reconstruct(
         counts={
             "candidates": len(hull), "gaussians": len(refined.gaussians.means_mm),
             "branches": len(tree.branches), "steps": refined.steps,
-            "rejected_steps": refined.rejected_steps,
+            "rejected_steps": refined.rejected_steps, "alternatives": len(open_),
         },
-        losses=tuple(refined.losses), predictor=centers.source, refiner=options.refine.refiner,
+        losses=tuple(refined.losses), predictor=centers.source, refiner=how.refiner,
         model=None if predictor is None
         else {"name": predictor.model.name, "sha256": predictor.model.sha256},
         notes=(), options=options,
@@ -151,9 +175,11 @@ def _vessels(
     options: RunOptions,
     segmenter: Segmenter | None,
     report: Callable[[float], None],
+    watch: Stopwatch,
 ) -> list[VesselImage]:
     views = []
     for angiogram in angiograms:
+        watch.check()
         views.append(extract_vessels(angiogram, options.imaging, segmenter))
         report(len(views) / len(angiograms))
     return views

@@ -18,12 +18,12 @@ FLOORS = {
     "imaging": 2, "gaussians": 2,
     "tree": 3, "dicom": 3,
     "predict": 4, "refine": 4,
-    "quality": 5, "metrics": 5,
+    "quality": 5, "metrics": 5, "alternatives": 5,
     "output": 6,
     "selftest": 6, "data": 6,
     "reconstruct": 7,
     "engine": 8,
-    "inspection": 9, "worker": 9, "batch": 9,
+    "inspection": 9, "worker": 9, "batch": 9, "benchmark": 9,
     "cli": 10,
 }  # fmt: skip
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load

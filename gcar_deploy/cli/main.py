@@ -21,6 +21,7 @@ VERBS = {
     "demo": ("gcar_deploy.cli.demo", "Reconstruct the case that comes along."),
     "batch": ("gcar_deploy.cli.batch", "Reconstruct every case of a table."),
     "serve": ("gcar_deploy.cli.serve", "Keep a warm engine for host programs."),
+    "bench": ("gcar_deploy.cli.bench", "Measure speed against error."),
     "doctor": ("gcar_deploy.cli.doctor", "Check this installation."),
     "info": ("gcar_deploy.cli.info", "Print what a result folder or a model is."),
 }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,9 @@ from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
 from gcar_deploy.predict.golden import check_golden
 from gcar_deploy.predict.model_spec import ModelFile
 from gcar_deploy.types import Array
+
+#: how often a running inference is asked whether it should end, seconds
+WATCH_S = 0.02
 
 
 class CenterPredictor:
@@ -80,7 +85,10 @@ class CenterPredictor:
         return found
 
     def predict(
-        self, candidates: Candidates, encoded: Encoded, run_options: Any = None
+        self,
+        candidates: Candidates,
+        encoded: Encoded,
+        should_stop: Callable[[], bool] | None = None,
     ) -> CenterPoints:
         """Judge every candidate.
 
@@ -88,7 +96,7 @@ class CenterPredictor:
         ----------
         candidates : Candidates (n points)
         encoded : Encoded, from ``encode`` with the same candidates
-        run_options : onnxruntime.RunOptions, to terminate a running call
+        should_stop : asked every ``WATCH_S`` from another thread; True ends a running inference
 
         Returns
         -------
@@ -99,9 +107,12 @@ class CenterPredictor:
         ------
         ModelError, NumericalError
             The model cannot run on these inputs; it returned values that are not finite.
+        CancelledError
+            ``should_stop`` said so.
         """
         feed = dict(zip(input_names(), flat_inputs(encoded), strict=True))
-        out = self._run(None, feed, run_options)[0]
+        with _watched(should_stop) as run_options:
+            out = self._run(None, feed, run_options)[0]
         if out.shape != (len(candidates), 5) or not np.isfinite(out).all():
             raise NumericalError(f"model {self.model.name} returned values that are not finite")
         h = candidates.spacing_mm
@@ -113,6 +124,30 @@ class CenterPredictor:
             source="multi",
             offset_mm=out[:, 1:4].astype(np.float64) * h,
         )
+
+
+@contextlib.contextmanager
+def _watched(should_stop: Callable[[], bool] | None) -> Iterator[Any]:
+    """RunOptions whose run ends soon after ``should_stop`` says so; None without a question."""
+    if should_stop is None:
+        yield None
+        return
+    run_options, over = ort.RunOptions(), threading.Event()
+
+    def watch() -> None:
+        # Inference holds the calling thread for its whole length: only another one can ask.
+        while not over.wait(WATCH_S):
+            if should_stop():
+                run_options.terminate = True
+                return
+
+    watcher = threading.Thread(target=watch, name="gcar-watch", daemon=True)
+    watcher.start()
+    try:
+        yield run_options
+    finally:
+        over.set()
+        watcher.join()
 
 
 def _check_inputs(model: ModelFile, session: Any) -> None:

@@ -1,0 +1,138 @@
+"""gcar bench: speed against error over the settings that trade one for the other."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gcar_deploy.cli.common import ProgressBar, limit_threads, set_up_logging
+
+_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+COLUMNS = (
+    "case", "predictor", "refiner", "iterations", "gaussians_cap", "pixels", "status",
+    "gaussians", "p50_s", "p95_s", "pairs", "peak_mb", "dsc", "rmse_mm", "p95_mm", "over_bound",
+)  # fmt: skip
+
+
+@click.command("bench")
+@click.option(
+    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
+)
+@click.option("--data", type=_FOLDER, help="Label volumes to simulate views of, beside the demo.")
+@click.option("--quick", is_flag=True, help="A coarse grid: about a tenth of the time.")
+@click.option("--repeats", type=click.IntRange(1, 100), default=5, show_default=True)
+@click.option("--threads", type=click.IntRange(1, 256), default=None, help="At most so many.")
+@click.option("--force", is_flag=True, help="Replace bench.csv and bench.svg in the folder.")
+@click.option("--quiet", is_flag=True, help="Neither progress nor warnings.")
+@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+def bench(
+    out_dir: Path,
+    data: Path | None,
+    quick: bool,
+    repeats: int,
+    threads: int | None,
+    force: bool,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Measure speed against error on the demo tree: bench.csv and bench.svg.
+
+    The grid runs over iterations, Gaussians, resolution, refiner and predictor. Times are those
+    of a warm reconstruction, and with itk-rtk installed also multiples of one projection pair.
+
+    \b
+    Example:
+      gcar bench --quick --out bench
+    """  # noqa: D301 - click wants a real backspace
+    from gcar_deploy.errors import UsageError
+
+    set_up_logging(verbose, quiet)
+    limit_threads(threads)
+    csv_file, svg_file = out_dir / "bench.csv", out_dir / "bench.svg"
+    for path in (csv_file, svg_file):
+        if path.exists() and not force:
+            raise UsageError(f"{path} exists; --force replaces it")
+    if out_dir.exists() and not out_dir.is_dir():
+        raise UsageError(f"{out_dir} is not a folder")
+    from gcar_deploy import benchmark
+
+    cases = [benchmark.demo(), *(benchmark.label_cases(data) if data else [])]
+    grid = benchmark.cells(quick)
+    pair = benchmark.pair_seconds(cases[0])
+    rows: list[benchmark.Row] = []
+    with ProgressBar(quiet=quiet) as bar:
+        for row in benchmark.run(cases, grid, repeats=repeats, threads=threads, pair=pair):
+            rows.append(row)
+            bar(f"{row.case} {row.cell.refiner}", len(rows) / (len(grid) * len(cases)))
+    out_dir.mkdir(parents=True, exist_ok=True)
+    csv_file.write_text(_csv(rows), encoding="utf-8")
+    first = [row for row in rows if row.case == cases[0].name]
+    svg_file.write_text(chart(first, cases[0].name), encoding="utf-8")
+    click.echo("\n".join([str(csv_file), str(svg_file), *_lines(first, pair is not None)]))
+
+
+def chart(rows: list[Any], name: str) -> str:
+    """Return the rows of one case as an SVG document."""
+    from gcar_deploy.benchmark import front, knee
+    from gcar_deploy.output.tradeoff import Point, tradeoff_svg
+
+    def point(row: Any) -> Point:
+        return Point(
+            seconds=row.p50_s, error_mm=row.rmse_mm, text=_words(row),
+            series=f"{row.cell.predictor} + {row.cell.refiner}",
+        )  # fmt: skip
+
+    usable = [row for row in rows if row.p50_s is not None and row.rmse_mm is not None]
+    best = knee(usable)
+    bound = None
+    if best is not None and best.rmse_mm is not None and best.over_bound:
+        bound = best.rmse_mm / best.over_bound
+    return tradeoff_svg(
+        [point(row) for row in usable],
+        [point(row) for row in front(usable)],
+        None if best is None else point(best),
+        title=f"Speed against error: {name}",
+        bound_mm=bound,
+    )
+
+
+def _words(row: Any) -> str:
+    cap = "" if row.cell.gaussians is None else f", at most {row.cell.gaussians} Gaussians"
+    return (
+        f"{row.cell.predictor} + {row.cell.refiner}, {row.cell.iterations} iterations{cap}, "
+        f"{row.cell.pixels} px: {row.p50_s:.3g} s, {row.rmse_mm:.3g} mm"
+    )
+
+
+def _csv(rows: list[Any]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for r in rows:
+        c = r.cell
+        figures = (r.p50_s, r.p95_s, r.pairs, r.peak_mb, r.dsc, r.rmse_mm, r.p95_mm, r.over_bound)
+        writer.writerow(
+            [r.case, c.predictor, c.refiner, c.iterations, c.gaussians, c.pixels, r.status, r.used]
+            + [None if value is None else f"{value:.5g}" for value in figures]
+        )
+    return text.getvalue()
+
+
+def _lines(rows: list[Any], paired: bool) -> list[str]:
+    from gcar_deploy.benchmark import front, knee
+
+    best = front(rows)
+    if not best:
+        return ["no setting gave a result"]
+    out = ["Pareto front:", *(f"  {_words(row)}" for row in best)]
+    at = knee(rows)
+    if at is not None:
+        unit = "" if at.pairs is None else f" = {at.pairs:.1f} itk-rtk pairs"
+        out.append(f"more work buys nothing past: {_words(at)}{unit}")
+    if not paired:
+        out.append("itk-rtk is not installed: no pair to compare with (extra export)")
+    return out

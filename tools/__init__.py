@@ -1,0 +1,1 @@
+"""Tools of the project itself: battery, requirements, bill of materials. Not installed."""
