@@ -128,6 +128,7 @@ def test_a_bare_import_loads_nothing_heavy():
     assert not loaded_by("import gcar_deploy") & set(HEAVY)
 
 
+@pytest.mark.req("REQ-37")
 def test_help_loads_nothing_heavy():
     code = (
         "from gcar_deploy.cli.main import gcar\n"
@@ -138,6 +139,7 @@ def test_help_loads_nothing_heavy():
     assert not loaded_by(code) & set(HEAVY)
 
 
+@pytest.mark.req("REQ-37")
 def test_the_whole_runtime_never_imports_torch():
     modules = [
         "gcar_deploy." + name_of(p)[:-3].replace("/", ".").removesuffix(".__init__")
