@@ -331,6 +331,9 @@ class PaperOptions:
     #: stop when the best of so many steps is not better by this share
     patience: int = 20
     tolerance: float = 2e-3
+    #: what projects: ``numpy``, or ``torch`` (the reference twin) on ``cpu`` or ``cuda``
+    backend: str = "numpy"
+    device: str = "cpu"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -366,8 +369,9 @@ class QualityOptions:
     #: share of a view's skeleton that the reprojected tree explains
     good_coverage: float = 0.9
     min_coverage: float = 0.3
-    #: share of the reprojected tree that lies on the view's vessels
-    good_support: float = 0.85
+    #: share of the reprojected tree that lies on the view's vessels: at 0.99 and more
+    #: in 49 generated trees (clinical views, exact and moved) that came out right
+    good_support: float = 0.95
     min_support: float = 0.3
     #: how near counts, pixels of the picture, but at least so many mm at the isocentre: half a
     #: lattice cell is not an error

@@ -191,7 +191,7 @@ def prepare(
             run = read_run(picture, options.dicom, frames.pop(0))
             carm = _matched(view, run.pixels.shape, notes)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
-            notes += run.notes
+            notes += [f"view {view.id}: {note}" for note in run.notes]
             continue
         if isinstance(picture, np.ndarray):
             pixels, depth, sha256 = _from_array(view.id, picture, options.imaging.limits)

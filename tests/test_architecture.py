@@ -35,6 +35,7 @@ WALLED = {
     "nibabel": {"output/volume.py"},
     "pydicom": {"dicom/header.py", "dicom/frames.py", "output/dicom_stl.py"},
     "distributed": {"batch/pools.py"},
+    "pynetdicom": {"worker/listen.py"},
     "flask": {"worker/http.py"},
     "waitress": {"worker/http.py"},
 }
@@ -127,6 +128,7 @@ def test_a_bare_import_loads_nothing_heavy():
     assert not loaded_by("import gcar_deploy") & set(HEAVY)
 
 
+@pytest.mark.req("REQ-37")
 def test_help_loads_nothing_heavy():
     code = (
         "from gcar_deploy.cli.main import gcar\n"
@@ -137,6 +139,7 @@ def test_help_loads_nothing_heavy():
     assert not loaded_by(code) & set(HEAVY)
 
 
+@pytest.mark.req("REQ-37")
 def test_the_whole_runtime_never_imports_torch():
     modules = [
         "gcar_deploy." + name_of(p)[:-3].replace("/", ".").removesuffix(".__init__")

@@ -46,6 +46,7 @@ def test_arrays_with_a_scene_a_dict_or_a_file_give_one_result(case, engine, tmp_
         assert content(engine.reconstruct(arrays, geometry)) == whole
 
 
+@pytest.mark.req("REQ-36")
 def test_threads_share_one_engine_and_agree_to_the_byte(case, engine):
     angiograms, grid, _ = case
     alone = content(engine.reconstruct(angiograms, grid))
@@ -129,6 +130,7 @@ def test_progress_rises_from_stage_to_stage(case, engine):
     assert {"vessels", "candidates", "refine", "tree"} <= {stage for stage, _ in seen}
 
 
+@pytest.mark.req("REQ-21")
 def test_cancel_ends_within_a_stage(case, engine):
     angiograms, grid, _ = case
     flag = threading.Event()
@@ -144,6 +146,7 @@ def test_cancel_ends_within_a_stage(case, engine):
     assert "quality" not in stages
 
 
+@pytest.mark.req("REQ-21")
 def test_a_deadline_before_any_result_is_an_error(case, engine):
     angiograms, grid, _ = case
     with pytest.raises(CancelledError, match="deadline"):
@@ -161,6 +164,7 @@ def test_result_as_json_and_folder(case, engine, tmp_path):
     )
 
 
+@pytest.mark.req("REQ-36")
 def test_nothing_is_printed(case, engine, capfd):
     angiograms, grid, _ = case
     engine.warmup()

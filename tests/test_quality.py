@@ -44,6 +44,7 @@ def turned(angiogram, primary):
      (90, "ok"), (154, "ok"), (156, "degraded"), (174.5, "degraded"), (175.5, "refused"),
      (180, "refused")],
 )  # fmt: skip
+@pytest.mark.req("REQ-13")
 def test_separation(case, second, outcome):
     pair = [turned(case[0][0], 0.0), turned(case[0][1], second)]
     if outcome == "refused":
@@ -66,6 +67,7 @@ def test_the_same_picture_twice(case):
         check_views(pair, OPTIONS)
 
 
+@pytest.mark.req("REQ-13")
 def test_contradiction(case):
     views = case[1]
     assert check_consistency(views, [0.0, OPTIONS.good_disagreement], OPTIONS) == []

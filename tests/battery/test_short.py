@@ -38,6 +38,7 @@ def battery(*arguments: object) -> str:
         ("http", 0.05, "flask"),
     ],
 )
+@pytest.mark.req("REQ-45")
 def test_damaged_input_is_refused_in_one_line(kind, share, module):
     pytest.importorskip(module, reason=f"{kind} needs {module}")
     said = battery("fuzz", "--kind", kind, "--share", share, "--seed", 7)
@@ -46,6 +47,7 @@ def test_damaged_input_is_refused_in_one_line(kind, share, module):
 
 
 @pytest.mark.slow
+@pytest.mark.req("REQ-45")
 def test_damaged_command_lines_are_refused_in_one_line():
     pytest.importorskip("torch", reason="needs the export extra")
     said = battery("fuzz", "--kind", "command", "--share", 0.1, "--seed", 7)
@@ -63,12 +65,14 @@ def test_a_run_goes_on_where_it_stopped(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.req("REQ-46")
 def test_faults_leave_the_old_result_or_the_new_one():
     said = battery("faults", "--kills", 4, "--signals", 4)
     assert "4 at random moments" in said and "4 of SIGINT, SIGTERM" in said
 
 
 @pytest.mark.slow
+@pytest.mark.req("REQ-33")
 def test_same_input_same_bytes():
     said = battery("determinism", "--repeats", 2, "--hash-seeds", 2)
     assert said.count(": 1 hash") == 2

@@ -79,6 +79,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
+@pytest.mark.req("REQ-19")
 def test_wrong_checkpoints_are_refused(checkpoint, name):
     WRONG[name](checkpoint)
     with pytest.raises(ModelError) as caught:
@@ -86,6 +87,7 @@ def test_wrong_checkpoints_are_refused(checkpoint, name):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
+@pytest.mark.req("REQ-19")
 def test_pickles_are_not_even_opened(tmp_path):
     for suffix in (".pt", ".pth", ".ckpt", ".bin", ".npz"):
         path = tmp_path / f"m{suffix}"
@@ -95,6 +97,7 @@ def test_pickles_are_not_even_opened(tmp_path):
             load_checkpoint(path)
 
 
+@pytest.mark.req("REQ-23")
 def test_the_command_says_it_in_one_line_and_leaves_nothing(checkpoint, tmp_path):
     checkpoint.write_bytes(np.random.default_rng(0).bytes(300))
     out = tmp_path / "out" / "m.onnx"

@@ -99,6 +99,7 @@ def test_schedule_is_a_function_of_the_step():
 
 
 @pytest.mark.slow
+@pytest.mark.req("REQ-48")
 def test_training_resumes_to_the_bit(tmp_path):
     options = PRESETS["tiny"]
     train(tmp_path / "whole", options, CONFIGS["tiny"])

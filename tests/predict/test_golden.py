@@ -41,6 +41,7 @@ def replaced(path: Path, data: bytes) -> None:
     np.savez(golden_path(path), **arrays)
 
 
+@pytest.mark.req("REQ-18")
 def test_every_shipped_model_has_one_and_keeps_it():
     shipped = shipped_model_path()
     assert shipped is not None
@@ -62,6 +63,7 @@ def test_shipped_files_are_those_of_the_manifest():
         assert hashlib.sha256((shipped.parent / name).read_bytes()).hexdigest() == digest, name
 
 
+@pytest.mark.req("REQ-18")
 def test_a_slightly_other_weight_is_noticed(tmp_path):
     shipped = shipped_model_path()
     assert shipped is not None
