@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_export.cli_centers import centers_table, robustness
 from gcar_export.cli_evaluate import converge, evaluate
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -247,5 +248,5 @@ def lumen_table(data: Path | None, count: int) -> None:
 
 
 # Verbs with files of their own.
-for _verb in (evaluate, converge):
+for _verb in (evaluate, converge, centers_table, robustness):
     main.add_command(_verb)
