@@ -11,6 +11,7 @@ import click
 
 from gcar_deploy.cli.common import (
     ProgressBar,
+    backend_options,
     chosen_dicom,
     dicom_options,
     engine_options,
@@ -35,6 +36,7 @@ from gcar_deploy.cli.common import (
     "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
 )
 @engine_options
+@backend_options
 @dicom_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
@@ -52,6 +54,8 @@ def run(
     refiner: str,
     deadline: float | None,
     threads: int | None,
+    backend: str,
+    device: str,
     frame: str,
     spacing: float | None,
     sod: float | None,
@@ -86,7 +90,7 @@ def run(
 
     extras = [name for name, wanted in (("glb", glb), ("dicom-stl", dicom_stl)) if wanted]
     check_extras(extras)
-    options = run_options(predictor, refiner)
+    options = run_options(predictor, refiner, backend, device)
     options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
     engine = Engine(model, threads=threads, options=options)
     with refusals_as_json(as_json), ProgressBar(quiet=quiet) as bar:
