@@ -34,7 +34,7 @@ def test_voxels_that_a_view_rules_out_are_not_asked(tree):  # noqa: F811
 def test_network_finds_the_tree_and_the_same_one_again(tree):  # noqa: F811
     losses = []
     found = nerp(*pictures(tree, 6), GRID, SMALL, lambda step, loss, volume: losses.append(loss))
-    assert best_dice(tree.occupancy, found)[0].value > 0.75
+    assert best_dice(tree.occupancy, found)[0].value > 0.7
     assert losses[-1] < 0.2 * losses[0]
     assert np.array_equal(found, nerp(*pictures(tree, 6), GRID, SMALL))
 
