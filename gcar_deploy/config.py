@@ -330,6 +330,9 @@ class PaperOptions:
     #: stop when the best of so many steps is not better by this share
     patience: int = 20
     tolerance: float = 2e-3
+    #: what projects: ``numpy``, or ``torch`` (the reference twin) on ``cpu`` or ``cuda``
+    backend: str = "numpy"
+    device: str = "cpu"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
