@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
@@ -69,7 +69,7 @@ class Engine:
         if threads is not None and threads < 1:
             raise UsageError(f"threads = {threads} must be 1 or more")
         self.threads = threads or min(os.cpu_count() or 1, 4)
-        self._predictor = _load(model, self.options.predict.predictor, self.threads, session)
+        self._predictor = _load(model, self.options.predict, self.threads, session)
         self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
 
     @property
@@ -325,8 +325,9 @@ def _scene(geometry: Geometry) -> Scene:
 
 
 def _load(
-    model: str | Path | None, wanted: str, threads: int, session: Any
+    model: str | Path | None, options: PredictOptions, threads: int, session: Any
 ) -> CenterPredictor | None:
+    wanted = options.predictor
     if wanted not in PREDICTORS:
         raise UsageError(f"predictor = {wanted!r} is none of {', '.join(PREDICTORS)}")
     if wanted == "none":
@@ -342,4 +343,4 @@ def _load(
             raise ModelError("no model is installed with this version; give one, or use none")
         _log.info("no model is installed: the visual hull is thinned instead")
         return None
-    return CenterPredictor(read_model(path), threads=threads, session=session)
+    return CenterPredictor(read_model(path, options.limits), threads=threads, session=session)
