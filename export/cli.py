@@ -157,19 +157,27 @@ def train(
 @main.command()
 @click.argument("checkpoint", type=_FILE)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-@click.option("--scenes", default=60, show_default=True, help="Scenes for the parity check.")
-def export(checkpoint: Path, out: Path, scenes: int) -> None:
+@click.option(
+    "--inputs", type=click.IntRange(1), default=60, show_default=True, help="For the parity check."
+)
+@click.option("--int8", is_flag=True, help="Also try OUT-int8.onnx, kept if the task allows it.")
+def export(checkpoint: Path, out: Path, inputs: int, int8: bool) -> None:
     """Turn CHECKPOINT (.safetensors) into one ONNX file with its spec, and prove it.
 
     Example: gcar-export export runs/a/checkpoint.safetensors --out models/gcp-multi.onnx
     """
-    from gcar_export.export_onnx import export_checked
+    from gcar_export.parity import export_checked
 
-    found = export_checked(checkpoint, out, scenes)
+    found = export_checked(checkpoint, out, inputs)
     click.echo(
-        f"{out}: {found.inputs} scenes, largest difference {found.worst:.1e} of the range, "
-        f"{found.decisions_equal:.4%} of decisions equal"
+        f"{out}: {found.inputs} inputs, largest difference {found.worst:.1e} of the range, "
+        f"{found.decisions_equal:.4%} of decisions equal; task: Dice {found.task_torch:.4f} with "
+        f"torch, {found.task_runtime:.4f} through the runtime"
     )
+    if int8:
+        from gcar_export.quantize import quantize_checked
+
+        click.echo(quantize_checked(out))
 
 
 @main.command()

@@ -171,7 +171,7 @@ def write_summaries(rows: Sequence[dict[str, Any]], out: Path, reference: str) -
     (out / "wilcoxon.json").write_text(tests)
     text = [tables.markdown(rows, reference), tables.over_views(rows)]
     text.append(paper_tables.layout(rows, reference))
-    short = tables.not_first(rows, reference)
+    short = tables.not_first(rows, reference) + tables.worse_with_views(rows, reference)
     text.append(f"Where {reference} is not first with p < 0.05:\n")
     text += [f"- {sentence}" for sentence in short] or ["- nowhere"]
     (out / "tables.md").write_text("\n".join(part for part in text if part) + "\n")

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 #: one colour per method: dark and light of one hue for neighbours in the list of methods.
 COLOURS = (
-    "#1f77b4", "#aec7e8", "#ff7f0e", "#ffbb78", "#d62728", "#98df8a", "#2ca02c", "#7f9f3f",
-    "#005f2f", "#e377c2", "#f7b6d2", "#9467bd", "#8c564b", "#444444", "#999999", "#bcbd22",
-    "#17becf",
+    "#1f77b4", "#aec7e8", "#4b5fa0", "#8fa3d9", "#ff7f0e", "#ffbb78", "#d62728", "#98df8a",
+    "#2ca02c", "#7f9f3f", "#005f2f", "#e377c2", "#f7b6d2", "#9467bd", "#8c564b", "#444444",
+    "#999999", "#bcbd22", "#17becf",
 )  # fmt: skip
 MARKERS = "osD^vPXdph<>"
 #: title -> (measure of the bars, measure of the lines), as in the paper's two figures.

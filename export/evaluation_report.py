@@ -162,7 +162,7 @@ def _page(
     parts.append(_html(tables.markdown(rows, reference)))
     parts.append(_html(tables.over_views(rows)))
     parts.append(_html(paper_tables.layout(rows, reference)))
-    short = tables.not_first(rows, reference)
+    short = tables.not_first(rows, reference) + tables.worse_with_views(rows, reference)
     parts.append(f"<h2>Where {html.escape(reference)} is not first with p &lt; 0.05</h2><ul>")
     parts += [f"<li>{html.escape(sentence)}</li>" for sentence in short] or ["<li>nowhere</li>"]
     parts.append("</ul><h2>Pictures</h2>")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -191,6 +192,24 @@ def over_views(rows: Sequence[Mapping[str, Any]], name: str = "dsc") -> str:
             out.append(f"| {method} | " + " | ".join(at.get(n, "") for n in views) + " |")
         out.append("")
     return "\n".join(out)
+
+
+def worse_with_views(rows: Sequence[Mapping[str, Any]], method: str) -> list[str]:
+    """Sentences, one for each step to more views at which ``method`` loses in the mean."""
+    out = []
+    mine = [row for row in rows if row["method"] == method]
+    for (protocol,), group in grouped(summarise(mine), ("protocol",)).items():
+        steps = sorted(group, key=lambda entry: int(entry["views"]))
+        for few, many in itertools.pairwise(steps):
+            for name, column in MEASURES.items():
+                a, b = few[name]["mean"], many[name]["mean"]
+                if a is None or b is None or (b - a) * column.better >= 0:
+                    continue
+                out.append(
+                    f"{protocol}, {column.heading}: {method} loses "
+                    f"{abs(b - a) * column.factor:.2f} from {few['views']} to {many['views']} views"
+                )
+    return out
 
 
 def not_first(rows: Sequence[Mapping[str, Any]], reference: str) -> list[str]:

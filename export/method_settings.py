@@ -27,12 +27,16 @@ class RuntimeRow:
     predictor, refiner : of ``RunOptions``; None for what the runtime does unasked
     centreline_loss : False turns the paper's centreline term off (alpha = 1)
     swapped : the views are given in the other order
+    pose : False leaves the views where the scene puts them
+    fused : False leaves the tubes round: no correction of the volume by pictures and points
     """
 
     predictor: str | None = None
     refiner: str | None = None
     centreline_loss: bool = True
     swapped: bool = False
+    pose: bool = True
+    fused: bool = True
 
 
 #: what the runtime does when asked for nothing in particular.
@@ -40,6 +44,8 @@ OURS = "ours"
 RUNTIME_ROWS: Mapping[str, RuntimeRow] = {
     OURS: RuntimeRow(),
     "ours-swapped": RuntimeRow(swapped=True),
+    "ours-nopose": RuntimeRow(pose=False),
+    "ours-round": RuntimeRow(fused=False),
     "hull": RuntimeRow(predictor="none", refiner="none"),
     "hull+paper": RuntimeRow(predictor="none", refiner="paper"),
     "hull+tube": RuntimeRow(predictor="none", refiner="tube"),
@@ -66,6 +72,8 @@ _STAGES = (
 DESCRIPTIONS: Mapping[str, str] = {
     OURS: "gcar as it comes: multi-view predictor, tube refinement",
     "ours-swapped": "the same, views given in the other order",
+    "ours-nopose": "the same without the estimate of shifts between the views",
+    "ours-round": "the same with round tubes alone in the volume",
     "hull": "hull thinned: no model, no refinement",
     "hull+paper": "hull thinned, the paper's refinement",
     "hull+tube": "hull thinned, tube refinement",
@@ -120,13 +128,18 @@ class MethodSettings:
             paper = dataclasses.replace(paper, steps=self.paper_steps)
         if not row.centreline_loss:
             paper = dataclasses.replace(paper, alpha=1.0)
+        volume = run.refine.volume
         return dataclasses.replace(
             run,
+            pose=dataclasses.replace(run.pose, enabled=run.pose.enabled and row.pose),
             predict=dataclasses.replace(
                 run.predict, predictor=row.predictor or run.predict.predictor
             ),
             refine=dataclasses.replace(
-                run.refine, refiner=row.refiner or run.refine.refiner, paper=paper
+                run.refine,
+                refiner=row.refiner or run.refine.refiner,
+                paper=paper,
+                volume=dataclasses.replace(volume, fuse=volume.fuse and row.fused),
             ),
         )
 

@@ -127,10 +127,17 @@ class _Session:
 
 @functools.cache
 def _session(options: RunOptions) -> _Session:
-    """One session per set of options and process."""
+    """One session per set of options and process.
+
+    Without its model the runtime falls back to the hull; a row must never do so unsaid.
+    """
     from gcar_deploy.engine import Engine
 
-    return _Session(Engine(options=options))
+    engine = Engine(options=options)
+    predictor = options.predict.predictor
+    if predictor != "none" and engine.model is None:
+        raise ModelError(f"predictor {predictor} has no model in this version")
+    return _Session(engine)
 
 
 def _runtime(case: Case, options: RunOptions, *, swapped: bool) -> Solved:
@@ -172,18 +179,22 @@ def path_lengths(case: Case) -> list[Image]:
 
 
 def voxel_sized(case: Case) -> tuple[list[Image], list[CArm]]:
-    """Path lengths and views with pixels of about a voxel at the isocentre, never finer ones."""
+    """Path lengths and views with pixels of about a voxel at the isocentre, never finer ones.
+
+    All views shrink alike, so that pictures of one size stay of one size.
+    """
     from gcar_deploy.imaging.resample import area_average
 
-    pictures, carms = [], []
-    for picture, carm in zip(path_lengths(case), case.scene_carms, strict=True):
-        scale = carm.pixel_at_isocenter_mm / float(np.min(case.grid.spacing_mm))
-        if scale < 1:
-            rows, columns = (max(round(n * scale), 1) for n in picture.shape)
-            picture, carm = area_average(picture, rows, columns), carm.resized(rows, columns)
-        pictures.append(picture)
-        carms.append(carm)
-    return pictures, carms
+    pictures, carms = path_lengths(case), case.scene_carms
+    finest = float(np.min(case.grid.spacing_mm))
+    scale = max(carm.pixel_at_isocenter_mm for carm in carms) / finest
+    if scale >= 1:
+        return pictures, carms
+    sizes = [tuple(max(round(n * scale), 1) for n in picture.shape) for picture in pictures]
+    return (
+        [area_average(picture, *size) for picture, size in zip(pictures, sizes, strict=True)],
+        [carm.resized(*size) for carm, size in zip(carms, sizes, strict=True)],
+    )
 
 
 @functools.cache
@@ -215,18 +226,18 @@ def _baseline(case: Case, method: str, settings: MethodSettings) -> Volume:
         from gcar_export.baselines.nerp import nerp
 
         return nerp(*voxel_sized(case), case.grid, settings.nerp)
+    if method == "sart":
+        from gcar_export.baselines.sart import sart
+
+        return sart(*voxel_sized(case), case.grid, settings.sart)
     given = path_lengths(case), case.scene_carms, case.grid
     if method == "visual_hull":
         from gcar_export.baselines.visual_hull import visual_hull
 
         return visual_hull(*given, settings.hull_path_mm)
-    if method == "fdk":
-        from gcar_export.baselines.fdk import fdk
+    from gcar_export.baselines.fdk import fdk
 
-        return fdk(*given, settings.fdk)
-    from gcar_export.baselines.sart import sart
-
-    return sart(*given, settings.sart)
+    return fdk(*given, settings.fdk)
 
 
 def _fbp_paper(case: Case, settings: MethodSettings) -> tuple[Volume, int, str]:

@@ -12,6 +12,7 @@ import dataclasses
 import json
 import os
 import platform
+import sys
 import time
 from pathlib import Path
 
@@ -103,8 +104,7 @@ def train(out: Path, options: SegmenterOptions, *, minutes: float | None = None)
     )
     step = _resume(out, net, optimiser)
     began, losses = time.time(), []
-    stderr = click.get_text_stream("stderr")
-    with click.progressbar(length=options.steps, label="segmenter", file=stderr) as bar:
+    with click.progressbar(length=options.steps, label="segmenter", file=sys.stderr) as bar:
         bar.update(step)
         while step < options.steps:
             if minutes is not None and time.time() - began > 60 * minutes:

@@ -25,8 +25,13 @@ from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.center_predictor import CenterPredictor
-from gcar_deploy.predict.model_spec import SEGMENTER_MODEL, read_model, shipped_model_path
+from gcar_deploy.predict.center_predictor import Predictor, open_predictor
+from gcar_deploy.predict.model_spec import (
+    SEGMENTER_MODEL,
+    SHIPPED,
+    read_model,
+    shipped_model_path,
+)
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
 
@@ -54,7 +59,8 @@ class Engine:
     Raises
     ------
     ModelError
-        The model is missing, altered or unfit.
+        The model given is missing, or a model is altered or unfit. Where no model is given and
+        none is installed, the visual hull is thinned instead, and every result says so.
     """
 
     def __init__(
@@ -70,6 +76,9 @@ class Engine:
             raise UsageError(f"threads = {threads} must be 1 or more")
         self.threads = threads or min(os.cpu_count() or 1, 4)
         self._predictor = _load(model, self.options.predict, self.threads, session)
+        self._notes: tuple[str, ...] = ()
+        if self._predictor is None and self.options.predict.predictor != "none":
+            self._notes = (_missing(self.options.predict.predictor),)
         self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
 
     @property
@@ -136,7 +145,7 @@ class Engine:
             cancel=cancel,
             used_s=time.perf_counter() - started,
         )
-        return dataclasses.replace(result, notes=(*notes, *result.notes))
+        return dataclasses.replace(result, notes=(*notes, *self._notes, *result.notes))
 
 
 def prepare(
@@ -326,7 +335,7 @@ def _scene(geometry: Geometry) -> Scene:
 
 def _load(
     model: str | Path | None, options: PredictOptions, threads: int, session: Any
-) -> CenterPredictor | None:
+) -> Predictor | None:
     wanted = options.predictor
     if wanted not in PREDICTORS:
         raise UsageError(f"predictor = {wanted!r} is none of {', '.join(PREDICTORS)}")
@@ -334,13 +343,20 @@ def _load(
         if model is not None:
             raise UsageError("predictor none uses no model; leave the model away")
         return None
-    if wanted == "single":
-        # The single-view predictor has other inputs and no shipped model yet.
-        raise ModelError("predictor single has no model in this version; use multi or none")
-    path = shipped_model_path() if model is None else Path(model)
+    path = shipped_model_path(_shipped(wanted)) if model is None else Path(model)
     if path is None:
-        if wanted == "multi":
-            raise ModelError("no model is installed with this version; give one, or use none")
-        _log.info("no model is installed: the visual hull is thinned instead")
+        _log.info("%s", _missing(wanted))
         return None
-    return CenterPredictor(read_model(path, options.limits), threads=threads, session=session)
+    file = read_model(path, options.limits)
+    if wanted not in ("auto", file.kind):
+        raise ModelError(f"model {file.name} is of kind {file.kind}, not {wanted}")
+    return open_predictor(file, threads=threads, session=session)
+
+
+def _shipped(wanted: str) -> str:
+    """Name of the model that a predictor uses unless one is given."""
+    return SHIPPED["multi" if wanted == "auto" else wanted]
+
+
+def _missing(wanted: str) -> str:
+    return f"{_shipped(wanted)}.onnx is not installed: the visual hull was thinned instead"

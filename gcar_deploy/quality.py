@@ -35,7 +35,8 @@ class ViewQuality:
     view_id : str
     name : str, clinical words, for instance ``'RAO 30 CAU 20'``
     coverage : share of the picture's skeleton near the reprojected centreline
-    support : share of the reprojected centreline (inside the picture) near the skeleton
+    support : share of the reprojected centreline (inside the picture) near the vessel mask; not
+        its skeleton, which runs between two vessels that lie side by side
     distance_mm : mean distance of the skeleton from the centreline, at the isocentre
     overlap : Dice coefficient of vessel mask and reprojected lumen
     coverage_2px : as ``coverage``, but within 2 pixels of the picture, whatever their size
@@ -305,7 +306,7 @@ def view_quality(
         strict = float((gap <= 2.0).mean())
         visible = line & view.valid
         if visible.any():
-            support = float((_distance_to(view.skeleton)[visible] <= near_px).mean())
+            support = float((_distance_to(view.mask)[visible] <= near_px).mean())
     total = int(lumen.sum()) + int(view.mask.sum())
     return ViewQuality(
         view_id=view.view_id,

@@ -22,10 +22,11 @@ from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
-from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.decide import decide
-from gcar_deploy.predict.encoding import encode
+from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose, estimate_poses
@@ -52,7 +53,7 @@ def reconstruct(
     grid: Grid,
     options: RunOptions,
     *,
-    predictor: CenterPredictor | None = None,
+    predictor: Predictor | None = None,
     segmenter: Segmenter | None = None,
     on_progress: OnProgress | None = None,
     deadline_s: float | None = None,
@@ -66,7 +67,7 @@ def reconstruct(
     angiograms : 2 or more pictures with their C-arms
     grid : Grid of the volume that is asked for
     options : RunOptions
-    predictor : CenterPredictor, or None to thin the visual hull instead
+    predictor : of either kind, or None to thin the visual hull instead
     segmenter : Segmenter, where ``options.imaging.segmenter`` asks for one
     on_progress : called with (stage, share of the work done)
     deadline_s : seconds after which the refinement ends with what it has
@@ -104,20 +105,10 @@ def reconstruct(
         quality.check_candidates(len(hull), lattice, options.quality)
         watch.check()
         encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
-    told = None
     with watch.stage("centers"):
+        centers, told = _centers(predictor, hull, encoded, views, options, watch)
         if predictor is None:
-            centers = thin_hull(hull, encoded, options.candidates)
             findings.append(_FALLBACK)
-        else:
-            calibrated = all(view.calibrated for view in views)
-            try:
-                stop = watch.should_stop if watch.interruptible else None
-                centers = told = predictor.predict(hull, encoded, stop)
-            except CancelledError:
-                watch.check()
-                raise
-            centers = decide(centers, encoded, calibrated, options.decide)
     with watch.stage("refine") as report:
         before_s = watch.elapsed_s
         watch.require(UNREFINED_SHARE * before_s)
@@ -168,6 +159,31 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
     """Return the edge of the lattice: the grid's own where the predictor knows such cells."""
     own = float(np.mean(grid.spacing_mm))
     return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
+
+
+def _centers(
+    predictor: Predictor | None,
+    hull: Candidates,
+    encoded: Encoded,
+    views: Sequence[VesselImage],
+    options: RunOptions,
+    watch: Stopwatch,
+) -> tuple[CenterPoints, CenterPoints | None]:
+    """Which of the hull's points are vessel, and what the multi-view predictor said of each."""
+    if predictor is None:
+        return thin_hull(hull, encoded, options.candidates), None
+    stop = watch.should_stop if watch.interruptible else None
+    try:
+        if isinstance(predictor, SingleViewPredictor):
+            alone = predictor.predict([(view.carm, view.path_mm) for view in views], stop)
+            single = options.predict.single
+            return merge_views(alone, hull, encoded, options.candidates, single), None
+        told = predictor.predict(hull, encoded, stop)
+    except CancelledError:
+        watch.check()
+        raise
+    calibrated = all(view.calibrated for view in views)
+    return decide(told, encoded, calibrated, options.decide), told
 
 
 def _vessels(

@@ -35,6 +35,7 @@ WALLED = {
     "nibabel": {"output/volume.py"},
     "pydicom": {"dicom/header.py", "dicom/frames.py", "output/dicom_stl.py"},
     "distributed": {"batch/pools.py"},
+    "pynetdicom": {"worker/listen.py"},
     "flask": {"worker/http.py"},
     "waitress": {"worker/http.py"},
 }

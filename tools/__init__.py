@@ -1,1 +1,1 @@
-"""Tools of the project itself: battery, requirements, bill of materials. Not installed."""
+"""Tools of the project itself: command reference, battery, requirements, bill of materials."""

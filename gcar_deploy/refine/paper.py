@@ -15,10 +15,11 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
 from gcar_deploy.config import PaperOptions
+from gcar_deploy.gaussians.backends import Backend, backend_named
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.density_control import clone, most_wanting, prune, split
 from gcar_deploy.gaussians.gaussians import TWO_PI_3_2, Gaussians
-from gcar_deploy.gaussians.project import Gradient, project, project_vjp
+from gcar_deploy.gaussians.project import Gradient
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import sampled
 from gcar_deploy.refine.adam import Adam
@@ -27,6 +28,10 @@ from gcar_deploy.types import Array, Points
 
 Progress = Callable[[float], None]
 MOST_REJECTED = 5
+#: a Gaussian is at most so many times as long as it is wide
+MOST_ANISOTROPY = 20.0
+#: bounds of the contrast of a picture that is not calibrated
+CONTRAST_BOUNDS = (0.4, 2.5)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +45,7 @@ class PaperResult:
     steps, rejected_steps : int
     pruned : reason -> how many Gaussians went
     status : ``ok``, ``stopped`` (by the caller) or ``failed`` (numbers not finite)
+    contrast : per view, factor of the picture's path on the model's, 1 where calibrated
     """
 
     gaussians: Gaussians
@@ -48,6 +54,7 @@ class PaperResult:
     rejected_steps: int
     pruned: dict[str, int]
     status: str
+    contrast: tuple[float, ...]
 
 
 def initial_gaussians(centers: CenterPoints, options: PaperOptions) -> Gaussians:
@@ -115,20 +122,26 @@ def refine_paper(
     should_stop : asked before every step
     """
     gaussians = start if isinstance(start, Gaussians) else initial_gaussians(start, options)
+    over = len(gaussians) - options.most_gaussians
+    if over > 0:
+        heavy = np.argsort(-gaussians.masses_mm3(), kind="stable")[: options.most_gaussians]
+        gaussians = gaussians.select(np.sort(heavy))
+    backend = backend_named(options.backend, options.device)
     views = [sampled(view, options.pixel_mm) for view in views]
     finest = min(view.carm.pixel_at_isocenter_mm for view in views)
     scaling = _Scaling(options.least_sigma_pixels * finest, options.largest_sigma_mm)
-    free, adam = _freed(gaussians, scaling), _adam(options)
+    free, adam = _capped(_freed(gaussians, scaling), scaling), _adam(options)
     losses: list[float] = []
     rejected = in_a_row = 0
-    pruned: dict[str, int] = {}
-    best, status, step = (np.inf, gaussians), "ok", 0
+    pruned: dict[str, int] = {"cap": over} if over > 0 else {}
+    gaussians = _bound(free, scaling)
+    best, status, step = (np.inf, gaussians, (1.0,) * len(views)), "ok", 0
     for step in range(options.steps):
         if should_stop is not None and should_stop():
             status = "stopped"
             break
         gaussians = _bound(free, scaling)
-        loss, gradient = _loss(gaussians, views, options)
+        loss, gradient, contrast = _loss(gaussians, views, options, backend)
         moves = adam.step(_to_free(gradient, free, scaling), _cooling(step, options))
         if not (np.isfinite(loss) and all(np.isfinite(m).all() for m in moves.values())):
             rejected, in_a_row = rejected + 1, in_a_row + 1
@@ -141,10 +154,10 @@ def refine_paper(
         in_a_row = 0
         losses.append(loss)
         if loss < best[0]:
-            best = (loss, gaussians)
+            best = (loss, gaussians, contrast)
         if _no_progress(losses, options):
             break
-        free = {name: value + moves[name] for name, value in free.items()}
+        free = _capped({name: value + moves[name] for name, value in free.items()}, scaling)
         if options.control_every and step and step % options.control_every == 0:
             free = _controlled(free, gradient, scaling, options, finest, pruned)
             adam.restart()
@@ -157,6 +170,7 @@ def refine_paper(
         rejected_steps=rejected,
         pruned=pruned,
         status=status,
+        contrast=best[2],
     )
 
 
@@ -201,6 +215,25 @@ def _bound(free: dict[str, Array], scaling: _Scaling) -> Gaussians:
     )
 
 
+def _capped(free: dict[str, Array], scaling: _Scaling) -> dict[str, Array]:
+    """Thicken Gaussians longer than ``MOST_ANISOTROPY`` times their width; masses are kept."""
+    scales = scaling.bound(free["scales"])
+    least = scales.max(axis=1, initial=0.0, keepdims=True) / MOST_ANISOTROPY
+    thin = (scales < least).any(axis=1)
+    if not thin.any():
+        return free
+    g = _bound(free, scaling)
+    wide = np.maximum(scales, least)
+    shrink = np.prod(scales / wide, axis=1)
+    changed = _freed(
+        dataclasses.replace(g, scales_mm=wide, intensity=g.intensity * shrink), scaling
+    )
+    return {
+        name: np.where(thin.reshape((-1,) + (1,) * (value.ndim - 1)), changed[name], value)
+        for name, value in free.items()
+    }
+
+
 def _to_free(g: Gradient, free: dict[str, Array], scaling: _Scaling) -> dict[str, Array]:
     return {
         "means": g.means_mm,
@@ -227,19 +260,30 @@ def _cooling(step: int, options: PaperOptions) -> float:
 
 
 def _loss(
-    g: Gaussians, views: Sequence[VesselImage], options: PaperOptions
-) -> tuple[float, Gradient]:
-    total, parts = 0.0, []
+    g: Gaussians, views: Sequence[VesselImage], options: PaperOptions, backend: Backend
+) -> tuple[float, Gradient, tuple[float, ...]]:
+    """Sum of the views' losses, its gradient, and the contrast of each view."""
+    total, parts, contrast = 0.0, [], []
     for view in views:
-        made = project(g, view.carm)
+        made = backend.project(g, view.carm)
+        factor = 1.0 if view.calibrated else _contrast(made, view)
         loss, by_picture = projection_loss(
-            made, view.path_mm, view.skeleton, view.valid, options.alpha
+            factor * made, view.path_mm, view.skeleton, view.valid, options.alpha
         )
         total += loss
-        parts.append(project_vjp(g, view.carm, by_picture))
+        parts.append(backend.vjp(g, view.carm, factor * by_picture))
+        contrast.append(factor)
     names = [f.name for f in dataclasses.fields(Gradient)]
     summed = {name: np.sum([getattr(p, name) for p in parts], axis=0) for name in names}
-    return total, Gradient(**summed)
+    return total, Gradient(**summed), tuple(contrast)
+
+
+def _contrast(made: Array, view: VesselImage) -> float:
+    """Least-squares factor of a picture whose scale is unknown (variable projection)."""
+    made = np.where(view.valid, made, 0.0)
+    power = float(np.sum(made * made))
+    factor = float(np.sum(made * view.path_mm)) / power if power > 0 else 1.0
+    return float(np.clip(factor, *CONTRAST_BOUNDS))
 
 
 def _no_progress(losses: Sequence[float], options: PaperOptions) -> bool:

@@ -171,6 +171,6 @@ def _paper(
         steps=out.steps,
         rejected_steps=out.rejected_steps,
         status=out.status,
-        contrast=(1.0,) * len(views),
+        contrast=out.contrast,
         centers=centers,
     )

@@ -60,6 +60,7 @@ class PerfectEngine:
     """Stands in for the runtime: returns what a table asks for."""
 
     answers: dict = {}  # noqa: RUF012
+    model = {"name": "stub"}  # noqa: RUF012
 
     def __init__(self, *, options=None):
         self.options = options
@@ -220,20 +221,23 @@ def test_rows_depend_on_their_own_settings_alone():
     assert plain.digest("ours") != plain.digest("ours-swapped")
     assert other.run_options("hull+paper").refine.paper.steps == 7
     assert plain.run_options("single+paper-noloss").refine.paper.alpha == 1.0
+    assert not plain.run_options("ours-nopose").pose.enabled
+    assert not plain.run_options("ours-round").refine.volume.fuse
+    assert plain.run_options("multi+tube") != plain.run_options("ours-round")
     assert set(DESCRIPTIONS) == set(METHODS)
     with pytest.raises(UsageError):
         MethodSettings(paper_steps=0)
 
 
 def test_a_missing_model_is_said_before_any_work(data, tmp_path, monkeypatch):
-    def missing(options):
-        raise ModelError("no such model")
+    from gcar_deploy import engine
 
-    monkeypatch.setattr(methods, "_session", missing)
+    monkeypatch.setattr(engine, "shipped_model_path", lambda name: None)
+    methods._session.cache_clear()
     options = evaluate.EvaluateOptions(
         data=data, out=tmp_path / "out", protocol="paper", methods=("fdk", "single+paper")
     )
-    with pytest.raises(ModelError, match="method single\\+paper: no such model"):
+    with pytest.raises(ModelError, match=r"^method single\+paper: predictor single has no model"):
         evaluate.evaluate(options)
     assert not (tmp_path / "out").exists()
 
@@ -330,6 +334,11 @@ def test_views_stand_side_by_side():
     rows = [_row("1", "ours", 0.8), {**_row("1", "ours", 0.9), "views": 4}]
     assert "| ours | 80.00 | 90.00 |" in evaluation_tables.over_views(rows)
     assert evaluation_tables.over_views(rows[:1]) == ""
+    assert evaluation_tables.worse_with_views(rows, "ours") == []
+    rows.append({**_row("1", "ours", 0.88), "views": 16})
+    assert evaluation_tables.worse_with_views(rows[::-1], "ours") == [
+        "paper, DSC(0.5) %: ours loses 2.00 from 4 to 16 views"
+    ]
 
 
 def test_undefined_values_are_left_out_and_counted():

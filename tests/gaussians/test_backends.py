@@ -1,0 +1,75 @@
+"""The torch twin behind the refiner gives what NumPy gives, within the stated tolerance."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gcar_deploy.errors import UsageError
+from gcar_deploy.gaussians.backends import (
+    GRADIENT_TOLERANCE,
+    PICTURE_TOLERANCE,
+    backend_named,
+)
+from gcar_deploy.refine.paper import refine_paper
+from tests.gaussians.test_project import carm, random_gaussians
+from tests.refine.test_paper import OPTIONS, points, views_of
+
+
+@pytest.mark.parametrize(
+    ("name", "device", "words"),
+    [
+        ("jax", "cpu", "none of numpy, torch"),
+        ("torch", "tpu", "none of cpu, cuda"),
+        ("numpy", "cuda", "needs the backend torch"),
+    ],
+)
+def test_what_is_not_there_is_said(name, device, words):
+    with pytest.raises(UsageError, match=words):
+        backend_named(name, device)
+
+
+def devices():
+    torch = pytest.importorskip("torch")
+    return ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+
+
+@pytest.mark.slow
+def test_pictures_and_gradients_agree():
+    numpy = backend_named("numpy")
+    g = random_gaussians(20, 3, spread=30)
+    quaternions = g.quaternions_wxyz.copy()
+    quaternions[5] = 0
+    means = g.means_mm.copy()
+    view = carm(32, 5.6, 30.0, 20.0)
+    means[9] = 2 * view.source_mm
+    g = dataclasses.replace(g, means_mm=means, quaternions_wxyz=quaternions)
+    picture = numpy.project(g, view)
+    rng = np.random.default_rng(0)
+    by_picture = rng.normal(size=picture.shape)
+    expected = numpy.vjp(g, view, by_picture)
+    for device in devices():
+        torch = backend_named("torch", device)
+        made = torch.project(g, view)
+        assert np.abs(made - picture).max() <= PICTURE_TOLERANCE * picture.max()
+        found = torch.vjp(g, view, by_picture)
+        for field in dataclasses.fields(expected):
+            a, b = getattr(found, field.name), getattr(expected, field.name)
+            if field.name == "quaternions_wxyz":
+                a, b = np.delete(a, 5, 0), np.delete(b, 5, 0)
+            assert np.linalg.norm(a - b) <= GRADIENT_TOLERANCE * np.linalg.norm(b), field.name
+
+
+@pytest.mark.slow
+def test_a_refinement_ends_in_the_same_place():
+    truth = random_gaussians(12, 2, spread=20, sigma=(1.5, 2.5))
+    start, views = points(truth, 1.0), views_of(truth, 32)
+    options = dataclasses.replace(OPTIONS, steps=5, control_every=0)
+    numpy = refine_paper(start, views, options)
+    for device in devices():
+        torch = refine_paper(
+            start, views, dataclasses.replace(options, backend="torch", device=device)
+        )
+        assert torch.status == "ok" and torch.steps == numpy.steps
+        np.testing.assert_allclose(torch.losses, numpy.losses, rtol=0.02)
+        assert np.abs(torch.gaussians.means_mm - numpy.gaussians.means_mm).max() < 0.1
