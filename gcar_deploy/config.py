@@ -197,6 +197,7 @@ class PredictOptions:
     #: edge of the lattice the predictor works on: the grid's own within these bounds, mm
     min_cell_mm: float = 0.85
     max_cell_mm: float = 1.5
+    limits: ModelLimits = dataclasses.field(default_factory=ModelLimits)
     single: SingleViewOptions = dataclasses.field(default_factory=SingleViewOptions)
 
 
