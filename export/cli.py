@@ -9,6 +9,8 @@ from pathlib import Path
 import click
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_export.cli_centers import centers_table, robustness
+from gcar_export.cli_evaluate import converge, evaluate
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -23,6 +25,19 @@ class _Group(click.Group):
         except GcarError as error:
             click.echo(f"error: {error}", err=True)
             sys.exit(error.exit_code)
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            sys.exit(130)
+        except (click.ClickException, click.Abort, click.exceptions.Exit):
+            raise
+        except ImportError as error:
+            click.echo(f"error: {error.name} is missing; pip install 'gcar[export]'", err=True)
+            sys.exit(1)
+        except Exception as error:
+            logging.getLogger("gcar_export").info("internal error", exc_info=True)
+            detail = (str(error).splitlines() or [""])[0][:200]
+            click.echo(f"error: internal: {type(error).__name__} {detail}; see -v", err=True)
+            sys.exit(1)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -31,62 +46,6 @@ def main(verbose: bool) -> None:
     """Simulate, evaluate and score coronary reconstructions."""
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
-
-
-@main.command()
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
-@click.option(
-    "--protocol",
-    type=click.Choice(["paper", "clinical", "moved", "raw"]),
-    default="paper",
-    show_default=True,
-)
-@click.option(
-    "--methods",
-    default="ours,hull,hull+paper,visual_hull",
-    show_default=True,
-    help="Comma-separated; the first is the one the others are tested against.",
-)
-@click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows and tables.")
-@click.option("--jobs", default=1, show_default=True, help="Processes.")
-@click.option("--cases", default="", help="Only these cases, comma-separated.")
-@click.option("--quiet", is_flag=True, help="No progress on stderr.")
-def evaluate(
-    data: Path,
-    protocol: str,
-    methods: str,
-    views: str,
-    out: Path,
-    jobs: int,
-    cases: str,
-    quiet: bool,
-) -> None:
-    """Run methods over label volumes and print the table.
-
-    Goes on where an earlier run with the same --out stopped.
-
-    Example: gcar-export evaluate --data data --protocol clinical --methods ours,hull
-    --views 2,4 --out results
-    """
-    from gcar_export import evaluate as evaluation
-    from gcar_export import evaluation_tables
-
-    options = evaluation.EvaluateOptions(
-        data=data,
-        out=out,
-        protocol=protocol,
-        methods=_words(methods),
-        views=_numbers(views),
-        jobs=jobs,
-        cases=_words(cases),
-    )
-
-    def progress(done: int, total: int, text: str) -> None:
-        click.echo(f"[{done}/{total}] {text}", err=True)
-
-    rows = evaluation.evaluate(options, None if quiet else progress)
-    click.echo(evaluation_tables.markdown(rows, options.methods[0]))
 
 
 @main.command()
@@ -154,17 +113,6 @@ def pair_time(label: Path, repeats: int) -> None:
     click.echo(f"ratio {found.ratio:.2f} (medians of {found.repeats})")
 
 
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(word) for word in _words(text))
-    except ValueError:
-        raise UsageError(f"{text!r} is not a comma-separated list of whole numbers") from None
-
-
 @main.command()
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
 @click.option(
@@ -210,19 +158,27 @@ def train(
 @main.command()
 @click.argument("checkpoint", type=_FILE)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-@click.option("--scenes", default=60, show_default=True, help="Scenes for the parity check.")
-def export(checkpoint: Path, out: Path, scenes: int) -> None:
+@click.option(
+    "--inputs", type=click.IntRange(1), default=60, show_default=True, help="For the parity check."
+)
+@click.option("--int8", is_flag=True, help="Also try OUT-int8.onnx, kept if the task allows it.")
+def export(checkpoint: Path, out: Path, inputs: int, int8: bool) -> None:
     """Turn CHECKPOINT (.safetensors) into one ONNX file with its spec, and prove it.
 
     Example: gcar-export export runs/a/checkpoint.safetensors --out models/gcp-multi.onnx
     """
-    from gcar_export.export_onnx import export_checked
+    from gcar_export.parity import export_checked
 
-    found = export_checked(checkpoint, out, scenes)
+    found = export_checked(checkpoint, out, inputs)
     click.echo(
-        f"{out}: {found.inputs} scenes, largest difference {found.worst:.1e} of the range, "
-        f"{found.decisions_equal:.4%} of decisions equal"
+        f"{out}: {found.inputs} inputs, largest difference {found.worst:.1e} of the range, "
+        f"{found.decisions_equal:.4%} of decisions equal; task: Dice {found.task_torch:.4f} with "
+        f"torch, {found.task_runtime:.4f} through the runtime"
     )
+    if int8:
+        from gcar_export.quantize import quantize_checked
+
+        click.echo(quantize_checked(out))
 
 
 @main.command()
@@ -341,3 +297,66 @@ def tree_table(data: Path | None, count: int) -> None:
     with click.progressbar(range(count), label="generated", file=sys.stderr) as seeds:
         generated = [generated_statistics(seed) for seed in seeds]
     click.echo(table(generated, [real_statistics(path) for path in real]))
+
+
+@main.command("lumen-table")
+@click.option(
+    "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
+)
+@click.option("--count", default=30, show_default=True, help="Cases, one stenosis each.")
+def lumen_table(data: Path | None, count: int) -> None:
+    """Measure stenosis, radius and branch lengths on trees with one known stenosis.
+
+    Left trees, the clinical views, stenoses of 30 .. 70 % of the diameter, 8 .. 16 mm long.
+
+    Example: gcar-export lumen-table --data data --count 27
+    """
+    from gcar_export.lumen_table import lumen_rows, table
+
+    with click.progressbar(length=count, label="cases", file=sys.stderr) as bar:
+        rows = lumen_rows(data, count, lambda: bar.update(1))
+    click.echo(table(rows))
+
+
+# Verbs with files of their own.
+for _verb in (evaluate, converge, centers_table, robustness):
+    main.add_command(_verb)
+
+
+@main.command()
+@click.option("--data", type=_FOLDER, required=True, help="Folder with phantom_xa/.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="New folder.")
+@click.option("--landmarks", type=_FILE, help="JSON of landmarks marked in the four views.")
+def phantom(data: Path, out: Path, landmarks: Path | None) -> None:
+    """Fit some real X-ray runs of a phantom, predict the others; tables and a page.
+
+    Example: gcar-export phantom --data data --out phantom
+    """
+    from gcar_export import phantom as study
+    from gcar_export.phantom_page import markdown, write_page
+
+    if out.exists() and any(out.iterdir()):
+        raise UsageError(f"{out} exists and is not empty")
+    found, fits = study.run(data, landmarks, lambda text: click.echo(text, err=True))
+    out.mkdir(parents=True, exist_ok=True)
+    text = markdown(fits)
+    (out / "table.md").write_text(text + "\n", encoding="utf-8")
+    click.echo(text)
+    click.echo(write_page(found, fits, out))
+
+
+@main.command("pose-table")
+@click.option("--trees", default=3, show_default=True, help="Generated trees.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows (JSON lines).")
+def pose_table(trees: int, out: Path) -> None:
+    """Measure trees from a second view that is off, with and without pose refinement.
+
+    Goes on where an earlier run with the same --out stopped.
+
+    Example: gcar-export pose-table --trees 3 --out pose.jsonl
+    """
+    from gcar_export import pose_table as study
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    rows = study.measure(out, trees, progress=lambda text: click.echo(text, err=True))
+    click.echo(study.markdown(rows))

@@ -14,13 +14,17 @@ import numpy as np
 from gcar_deploy.config import CandidateOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.predict.candidates import visual_hull
+from gcar_deploy.predict.candidates import Candidates, visual_hull
 from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_export.render import occupancy, path_lengths
 from gcar_export.trees import random_tree
 
 #: scenes with more candidates are drawn again: they cost more than they teach
 MAX_POINTS = 30_000
+#: (primary, secondary) of the paper's two views, and of those that are usual in practice
+PAPER_VIEWS = ((0, 0), (90, 0))
+USUAL_VIEWS = ((-30, -20), (45, 25), (-30, 25), (45, -25), (0, 35), (0, -30))
+USUAL_SPREAD_DEG = 5.0
 NET_PIXELS = 128
 
 
@@ -70,8 +74,13 @@ class Examination:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TrainingScene:
-    """One scene as the predictor meets it, with the truth at every candidate."""
+    """One scene as the predictor meets it, with the truth at every candidate.
 
+    ``views`` are (C-arm, path length in mm, calibrated) and ``hull`` is what they leave.
+    """
+
+    views: list[tuple[CArm, np.ndarray, bool]]
+    hull: Candidates
     encoded: Encoded
     points_mm: np.ndarray
     spacing_mm: float
@@ -99,9 +108,16 @@ def training_scene(
 
 
 def examination(
-    rng: np.random.Generator, options: SceneOptions, labels: Sequence[LabelTree] = ()
+    rng: np.random.Generator,
+    options: SceneOptions,
+    labels: Sequence[LabelTree] = (),
+    usual: bool = False,
 ) -> Examination | None:
-    """Draw a tree and its views; None where the tree does not fit into the cube."""
+    """Draw a tree and its views; None where the tree does not fit into the cube.
+
+    With ``usual`` the views are two of those that are taken in practice, give or take some
+    degrees; otherwise they are from anywhere.
+    """
     paper = rng.random() < options.paper_share
     if labels and rng.random() < options.label_share:
         tree = _label_tree(rng, labels, paper)
@@ -111,6 +127,8 @@ def examination(
     if rng.random() < options.more_views_share:
         views = int(rng.integers(3, 7))
     carms, h, shape = _paper_views(rng, views) if paper else _clinical_views(rng, views)
+    if usual:
+        carms = _turned_to_usual(rng, carms[:2], paper)
     spread = np.maximum(np.abs(tree.starts).max(), np.abs(tree.ends).max())
     if spread > 0.5 * h * shape - 2:
         return None
@@ -158,6 +176,8 @@ def _draw(
         return None
     truth, offset, radius = occupancy(hull.points_mm, h, tree.starts, tree.ends, tree.radii)
     return TrainingScene(
+        views=pictures,
+        hull=hull,
         encoded=encode(hull, pictures),
         points_mm=hull.points_mm,
         spacing_mm=h,
@@ -212,6 +232,23 @@ def _clinical_views(rng, n):
             )
         if all(25 < separation_deg(a, b) < 155 for i, a in enumerate(carms) for b in carms[:i]):
             return carms, h, 128
+
+
+def _turned_to_usual(rng, carms, paper):
+    """Keep distances and sizes, take the directions from ``USUAL_VIEWS``."""
+    if paper:
+        chosen = PAPER_VIEWS
+    else:
+        chosen = [USUAL_VIEWS[k] for k in rng.permutation(len(USUAL_VIEWS))[: len(carms)]]
+    out = []
+    for carm, (primary, secondary) in zip(carms, chosen, strict=True):
+        turn = rng.normal(size=2) * (0.0 if paper else USUAL_SPREAD_DEG)
+        out.append(
+            dataclasses.replace(
+                carm, primary_angle_deg=primary + turn[0], secondary_angle_deg=secondary + turn[1]
+            )
+        )
+    return out
 
 
 def picture(rng: np.random.Generator, carm: CArm, tree: Capsules) -> np.ndarray:

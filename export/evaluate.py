@@ -1,31 +1,28 @@
-"""Evaluate methods over label volumes: simulate, reconstruct, measure, tabulate.
+"""Evaluate methods over label volumes: simulate, reconstruct, measure, tabulate, draw.
 
 One job is one case, one number of views and one method; its row is written as soon as it
-is done, so an interrupted evaluation goes on where it stopped.
+is done, so an interrupted evaluation goes on where it stopped. Every row remembers the
+settings it was made with: rows of other settings are made anew, or refused, and never mixed
+in unsaid.
 """
 
 from __future__ import annotations
 
-import concurrent.futures
 import dataclasses
-import functools
 import json
 import logging
-import multiprocessing
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gcar_deploy.errors import UsageError
-from gcar_deploy.metrics import Measure, projection_measures, volume_measures
 from gcar_export import evaluation_tables as tables
-from gcar_export.labels import LabelVolume, read_label
-from gcar_export.methods import METHODS, Solved, solve
-from gcar_export.protocols import PROTOCOLS, Case, make_case
-from gcar_export.raycast import as_label, raycast
+from gcar_export import paper_tables
+from gcar_export.evaluation_engines import ENGINES, Outcome, run_in_processes, run_on_dask
+from gcar_export.evaluation_jobs import Job, case_name, row_path, write_done
+from gcar_export.method_settings import METHODS, MethodSettings
+from gcar_export.methods import check_models
+from gcar_export.protocols import PROTOCOLS
 
 LOGGER = logging.getLogger(__name__)
 #: where label volumes are looked for below the data folder, in this order.
@@ -33,6 +30,9 @@ LABEL_PATTERNS = (
     "imagecas/*.label.nii.gz", "asoca/*.npz", "asoca/*.nrrd",
     "*.label.nii.gz", "*.nii.gz", "*.nrrd", "*.mha",
 )  # fmt: skip
+#: what to do with rows that were made with other settings.
+CHANGED = ("redo", "keep", "refuse")
+OnProgress = Callable[[int, int, str], None]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,14 +41,20 @@ class EvaluateOptions:
 
     Attributes
     ----------
-    data : folder with label volumes (``imagecas/``, ``asoca/``, or the files themselves)
-    out : folder for rows and tables; may hold an interrupted evaluation
+    data : folder with label volumes (``imagecas/``, ``asoca/``, or the files themselves; a
+        folder that holds them in ``data/`` is taken as well)
+    out : folder for rows, tables and pictures; may hold an interrupted evaluation
     protocol : one of ``PROTOCOLS``
     methods : names from ``METHODS``
     views : numbers of views
     jobs : processes
     cases : only cases with these names; all if empty
     reference : method the others are tested against; the first of ``methods`` if None
+    engine : one of ``ENGINES``
+    scheduler : address of the Dask scheduler
+    changed : one of ``CHANGED``
+    redo : methods whose rows are made anew in any case
+    settings : MethodSettings
     """
 
     data: Path
@@ -59,6 +65,11 @@ class EvaluateOptions:
     jobs: int = 1
     cases: tuple[str, ...] = ()
     reference: str | None = None
+    engine: str = "processes"
+    scheduler: str | None = None
+    changed: str = "redo"
+    redo: tuple[str, ...] = ()
+    settings: MethodSettings = dataclasses.field(default_factory=MethodSettings)
 
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:
@@ -72,17 +83,12 @@ class EvaluateOptions:
             raise UsageError(f"jobs = {self.jobs} must be at least 1")
         if self.reference is not None and self.reference not in self.methods:
             raise UsageError(f"reference {self.reference!r} is not among the methods")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Job:
-    """One row to be made; ``row_path`` is where it goes."""
-
-    label: Path
-    protocol: str
-    method: str
-    views: int
-    row_path: Path
+        if self.engine not in ENGINES:
+            raise UsageError(f"engine {self.engine!r} is none of {', '.join(ENGINES)}")
+        if self.changed not in CHANGED:
+            raise UsageError(f"changed = {self.changed!r} is none of {', '.join(CHANGED)}")
+        if set(self.redo) - set(self.methods):
+            raise UsageError(f"redo = {', '.join(self.redo)}: not all are among the methods")
 
 
 def find_labels(data: Path) -> list[Path]:
@@ -94,16 +100,17 @@ def find_labels(data: Path) -> list[Path]:
         If there are none.
     """
     found: dict[Path, None] = {}
-    for pattern in LABEL_PATTERNS:
-        for path in sorted(data.glob(pattern)):
-            found.setdefault(path)
-    if not found:
-        raise UsageError(f"no label volume in {data} ({', '.join(LABEL_PATTERNS)})")
-    return list(found)
+    for folder in (data, data / "data"):
+        for pattern in LABEL_PATTERNS:
+            for path in sorted(folder.glob(pattern)):
+                found.setdefault(path.resolve())
+        if found:
+            return list(found)
+    raise UsageError(f"no label volume in {data} ({', '.join(LABEL_PATTERNS)})")
 
 
 def evaluate(
-    options: EvaluateOptions, on_progress: Callable[[int, int, str], None] | None = None
+    options: EvaluateOptions, on_progress: OnProgress | None = None
 ) -> list[dict[str, Any]]:
     """Run what is missing, write the tables, and return all rows.
 
@@ -111,31 +118,41 @@ def evaluate(
     ----------
     options : EvaluateOptions
     on_progress : called with (done, total, text) after each row
+
+    Raises
+    ------
+    UsageError
+        No label volume; rows of other settings and ``changed`` is ``refuse``; no cluster.
+    ModelError
+        A method's model is missing.
     """
     labels = [p for p in find_labels(options.data) if _wanted(p, options.cases)]
     if not labels:
         raise UsageError(f"none of the cases {', '.join(options.cases)} is in {options.data}")
-    rows_folder = options.out / "rows"
-    rows_folder.mkdir(parents=True, exist_ok=True)
+    check_models(options.methods, options.settings)
+    digests = {method: options.settings.digest(method) for method in options.methods}
     jobs = [
         Job(
-            label=label,
-            protocol=options.protocol,
-            method=method,
-            views=views,
-            row_path=rows_folder / f"{options.protocol}-{case_name(label)}-{views}-{method}.json",
+            label=label, protocol=options.protocol, method=method, views=views,
+            digest=digests[method],
         )
         for label in labels
         for views in options.views
         for method in options.methods
-    ]
-    missing = [job for job in jobs if not job.row_path.exists()]
+    ]  # fmt: skip
+    missing = _missing(jobs, options)
+    for folder in ("rows", "sides"):
+        (options.out / folder).mkdir(parents=True, exist_ok=True)
+    _write_settings(options)
     done = len(jobs) - len(missing)
-    for job in _run(missing, options.jobs):
+    if on_progress is not None and done:
+        on_progress(done, len(jobs), f"{done} rows kept")
+    for job, outcome in _outcomes(missing, options):
+        write_done(options.out, job, outcome)
         done += 1
         if on_progress is not None:
-            on_progress(done, len(jobs), job.row_path.stem)
-    rows = [json.loads(job.row_path.read_text()) for job in jobs]
+            on_progress(done, len(jobs), job.name)
+    rows = [_read(row_path(options.out, job)) for job in jobs]
     write_tables(rows, options.out, options.reference or options.methods[0])
     return rows
 
@@ -143,99 +160,70 @@ def evaluate(
 def write_tables(rows: Sequence[dict[str, Any]], out: Path, reference: str) -> None:
     """Write ``cases.csv``, ``summary.json``, ``wilcoxon.json`` and ``tables.md``."""
     (out / "cases.csv").write_text(tables.case_rows_csv(rows))
+    write_summaries(rows, out, reference)
+
+
+def write_summaries(rows: Sequence[dict[str, Any]], out: Path, reference: str) -> None:
+    """Write what follows from ``cases.csv``: the summary, the tests, the tables."""
     summary = json.dumps(tables.summarise(rows), indent=1, allow_nan=False)
     (out / "summary.json").write_text(summary)
     tests = json.dumps(tables.paired_tests(rows, reference), indent=1, allow_nan=False)
     (out / "wilcoxon.json").write_text(tests)
-    (out / "tables.md").write_text(tables.markdown(rows, reference))
+    text = [tables.markdown(rows, reference), tables.over_views(rows)]
+    text.append(paper_tables.layout(rows, reference))
+    short = tables.not_first(rows, reference) + tables.worse_with_views(rows, reference)
+    text.append(f"Where {reference} is not first with p < 0.05:\n")
+    text += [f"- {sentence}" for sentence in short] or ["- nowhere"]
+    (out / "tables.md").write_text("\n".join(part for part in text if part) + "\n")
 
 
-def case_name(label: Path) -> str:
-    """Name of the case a label file holds, as ``read_label`` gives it."""
-    stem = label.name.split(".")[0]
-    return f"asoca_{stem}" if label.suffix == ".npz" else stem
+def _missing(jobs: Sequence[Job], options: EvaluateOptions) -> list[Job]:
+    """Jobs without a row, and those whose row is out of date, which is said aloud."""
+    missing, changed = [], []
+    for job in jobs:
+        path = row_path(options.out, job)
+        if not path.exists() or job.method in options.redo:
+            missing.append(job)
+        elif _read(path).get("settings") != job.digest:
+            changed.append(job)
+    if not changed:
+        return missing
+    methods = ", ".join(dict.fromkeys(job.method for job in changed))
+    said = f"{len(changed)} rows of {methods} in {options.out} were made with other settings"
+    if options.changed == "refuse":
+        raise UsageError(f"{said}: take another --out, or --changed redo or keep")
+    if options.changed == "keep":
+        LOGGER.warning("%s: kept as they are", said)
+        return missing
+    LOGGER.warning("%s: made again", said)
+    order = {job: k for k, job in enumerate(jobs)}
+    return sorted([*missing, *changed], key=order.__getitem__)
 
 
-def measure(case: Case, solved: Solved) -> dict[str, Measure]:
-    """All measures of one solved case, by the names of ``evaluation_tables.MEASURES``.
-
-    New projections are cast from the returned volume, clipped to 0 .. 1, and averaged over
-    the case's new views (those on which the measure is defined).
-    """
-    found = volume_measures(case.truth, solved.volume, case.grid.spacing_mm)
-    per_view = []
-    for carm, truth_mm in zip(case.new_views, case.new_projections(), strict=True):
-        predicted = None
-        if solved.volume is not None and np.isfinite(solved.volume).all():
-            volume = as_label(np.clip(solved.volume, 0, 1), case.grid)
-            predicted = raycast(volume, carm)
-        per_view.append(projection_measures(truth_mm, predicted))
-    for name in per_view[0]:
-        found[f"new_{name}"] = _mean([view[name] for view in per_view])
-    return found
+def _outcomes(jobs: Sequence[Job], options: EvaluateOptions) -> Iterator[Outcome]:
+    if not jobs:
+        return iter(())
+    if options.engine == "dask":
+        return run_on_dask(jobs, options.settings, options.scheduler)
+    return run_in_processes(jobs, options.settings, options.jobs)
 
 
-def run_job(job: Job) -> dict[str, Any]:
-    """Make, write and return one row."""
-    case = _case(job.label, job.protocol, job.views)
-    solved = solve(case, job.method)
-    found = measure(case, solved)
-    row = {
-        "protocol": job.protocol,
-        "case": case.name,
-        "method": job.method,
-        "views": job.views,
-        "status": solved.status,
-        "sentence": solved.sentence,
-        "measures": {name: m.value for name, m in found.items()},
-        "reasons": {name: m.reason for name, m in found.items() if m.reason is not None},
-        "gaussians": solved.gaussians,
-        "seconds": float(solved.seconds["total"]),
-        "stages": {stage: float(s) for stage, s in solved.seconds.items()},
-    }
-    text = json.dumps(row, indent=1, allow_nan=False)
-    partial = job.row_path.with_suffix(f".{os.getpid()}.partial")
-    partial.write_text(text)
-    partial.replace(job.row_path)
+def _write_settings(options: EvaluateOptions) -> None:
+    """Add the settings of these methods to ``settings.json``, for whoever reads the folder."""
+    path = options.out / "settings.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    for method in options.methods:
+        known[method] = {
+            "digest": options.settings.digest(method),
+            "settings": options.settings.of(method),
+        }
+    path.write_text(json.dumps(known, indent=1, default=str))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    row: dict[str, Any] = json.loads(path.read_text())
     return row
-
-
-@functools.lru_cache(maxsize=1)
-def _label(path: Path) -> LabelVolume:
-    return read_label(path)
-
-
-@functools.lru_cache(maxsize=1)
-def _case(path: Path, protocol: str, views: int) -> Case:
-    return make_case(_label(path), protocol, views)
-
-
-def _run(jobs: Sequence[Job], processes: int) -> Any:
-    """Yield each job when its row is written."""
-    if processes == 1 or len(jobs) < 2:
-        for job in jobs:
-            run_job(job)
-            yield job
-        return
-    # Spawned, not forked: the runtime and numba keep threads that do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
-        waiting = {pool.submit(run_job, job): job for job in jobs}
-        try:
-            for future in concurrent.futures.as_completed(waiting):
-                future.result()
-                yield waiting[future]
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def _wanted(label: Path, names: Sequence[str]) -> bool:
     return not names or case_name(label) in names or label.name.split(".")[0] in names
-
-
-def _mean(measures: Sequence[Measure]) -> Measure:
-    values = [m.value for m in measures if m.value is not None]
-    if values:
-        return Measure(float(np.mean(values)))
-    return Measure(None, measures[0].reason)

@@ -1,109 +1,200 @@
-"""From a checkpoint to one ONNX file with its spec, and the proof that both say the same."""
+"""From a checkpoint to one ONNX file with its spec, whichever network the checkpoint holds."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
-from safetensors.torch import load_file
 
-from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES, flat_inputs, input_names
+from gcar_deploy.errors import ModelError
+from gcar_deploy.predict.center_map import (
+    DEPTH_PIXELS,
+    MAX_PATH_PIXELS,
+    OFFSET_PIXELS,
+)
+from gcar_deploy.predict.encoding import (
+    LEVELS,
+    VIEW_FEATURES,
+    flat_inputs,
+    input_names,
+)
+from gcar_export.checkpoint import filled, read_manifest, read_tensors
+from gcar_export.dataset import training_scene
 from gcar_export.networks.sparse import SparseConfig, SparsePredictor
+from gcar_export.networks.unet import UNetConfig, UNetPredictor
 
 OPSET = 18
 IR_VERSION = 10
-#: largest difference between torch and ONNX Runtime, as a share of the output's range
-PARITY = 1e-4
+#: a shipped model may weigh so much
+MAX_BYTES = 16 * 2**20
+_TRACE_SEED = 70_000
 
 
-class _Deployed(torch.nn.Module):
-    """The predictor with flat inputs and one output: confidence, offset, radius."""
+class DeployedSparse(torch.nn.Module):
+    """The multi-view predictor with flat inputs and one output: confidence, offset, radius."""
 
     def __init__(self, net: SparsePredictor) -> None:
         super().__init__()
         self.net = net
 
     def forward(self, features, ray, ray_path, weight, *tables):
+        """Arrays as ``flat_inputs`` orders them, to (n, 5)."""
         neighbours, parent = tables[: LEVELS + 1], tables[LEVELS + 1 : 2 * LEVELS + 1]
         members, children = tables[2 * LEVELS + 1], tables[2 * LEVELS + 2 :]
         out = self.net(features, ray, ray_path, weight, neighbours, parent, members, children)[-1]
         return torch.cat([torch.sigmoid(out[:, :1]), out[:, 1:]], dim=1)
 
 
-def load_checkpoint(path: Path) -> SparsePredictor:
-    """Read ``checkpoint.safetensors`` beside its ``manifest.json``; no pickle anywhere."""
-    manifest = json.loads((path.parent / "manifest.json").read_text())
+def load_checkpoint(path: Path) -> SparsePredictor | UNetPredictor:
+    """Read ``checkpoint.safetensors`` beside its ``manifest.json``; no pickle anywhere.
+
+    Raises
+    ------
+    ModelError
+        Either is damaged, or they do not belong together.
+    """
+    manifest = read_manifest(path)
     config = dict(manifest["config"])
-    config["width"] = tuple(config["width"])
-    net = SparsePredictor(SparseConfig(**config))
-    data = load_file(path)
-    net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
+    net: SparsePredictor | UNetPredictor
+    try:
+        config["width"] = tuple(config["width"])
+        if manifest.get("network", "sparse") == "unet":
+            net = UNetPredictor(UNetConfig(**config))
+        else:
+            net = SparsePredictor(SparseConfig(**config))
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, ZeroDivisionError) as error:
+        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
+    filled(net, read_tensors(path), path.name)
     return net.eval()
 
 
-def export_sparse(checkpoint: Path, out: Path, example) -> dict:
+def deployed(checkpoint: Path) -> torch.nn.Module:
+    """Return the network with the inputs and outputs of its ONNX graph."""
+    net = load_checkpoint(checkpoint)
+    return (DeployedSparse(net) if isinstance(net, SparsePredictor) else net).eval()
+
+
+def graph_inputs(net: torch.nn.Module) -> list[str]:
+    """Names of the graph's inputs."""
+    if isinstance(net, DeployedSparse):
+        return input_names()
+    return ["picture", "axes"] if net.config.pose else ["picture"]
+
+
+def export_model(checkpoint: Path, out: Path) -> dict[str, Any]:
     """Write ``out`` (.onnx) and its spec (.json); returns the spec.
 
-    Parameters
-    ----------
-    checkpoint : path of ``checkpoint.safetensors``
-    out : path of the ONNX file to write
-    example : Encoded
-        A real scene, to trace with.
+    Raises
+    ------
+    ModelError
+        The checkpoint has no manifest, or the graph would not be deterministic.
     """
-    import onnx
+    net = deployed(checkpoint)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    program = _trace_sparse(net) if isinstance(net, DeployedSparse) else _trace_unet(net)
+    program.save(str(out), external_data=False)
+    spec = _spec(net, _training(checkpoint), out.stem)
+    return finish(out, spec)
 
-    net = _Deployed(load_checkpoint(checkpoint)).eval()
-    tensors = tuple(torch.from_numpy(a) for a in flat_inputs(example))
+
+def _training(checkpoint: Path) -> dict[str, Any]:
+    """Return the manifest as it was at the step of this checkpoint."""
+    manifest = read_manifest(checkpoint)
+    best = manifest.pop("best", None)
+    if checkpoint.name == "best.safetensors" and best is not None:
+        manifest |= {"step": best["step"], "validation": best["validation"]}
+    return manifest
+
+
+def _trace_sparse(net: DeployedSparse) -> Any:
+    tensors = tuple(
+        torch.from_numpy(a) for a in flat_inputs(training_scene(_TRACE_SEED, 0).encoded)
+    )
     auto = torch.export.Dim.AUTO
     table_shapes = (
         *({0: auto} for _ in range(2 * LEVELS + 1)),
         {0: auto, 1: auto, 2: auto},
         *({0: auto} for _ in range(LEVELS)),
     )
-    shapes = (
-        {0: auto, 1: auto},
-        {0: auto, 1: auto},
-        {0: auto, 1: auto},
-        {0: auto, 1: auto},
-        table_shapes,
-    )
-    program = torch.onnx.export(
-        net,
-        tensors,
-        dynamo=True,
-        opset_version=OPSET,
-        external_data=False,
-        input_names=input_names(),
-        output_names=["centers"],
-        dynamic_shapes=shapes,
-    )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    program.save(str(out), external_data=False)
-    model = onnx.load(str(out))
+    shapes = (*({0: auto, 1: auto} for _ in range(4)), table_shapes)
+    return torch.onnx.export(
+        net, tensors, dynamo=True, opset_version=OPSET, external_data=False, verbose=False,
+        input_names=input_names(), output_names=["centers"], dynamic_shapes=shapes,
+    )  # fmt: skip
+
+
+def _trace_unet(net: UNetPredictor) -> Any:
+    n = net.config.pixels
+    # Two pictures, or the size of the batch would be taken for a constant.
+    example = (torch.rand(2, 1, n, n), torch.eye(3).repeat(2, 1, 1))[: len(graph_inputs(net))]
+    return torch.onnx.export(
+        net, example, dynamo=True, opset_version=OPSET, external_data=False, verbose=False,
+        input_names=graph_inputs(net), output_names=["centers"],
+        dynamic_shapes=tuple({0: torch.export.Dim("batch")} for _ in example),
+    )  # fmt: skip
+
+
+def _spec(net: torch.nn.Module, manifest: dict[str, Any], name: str) -> dict[str, Any]:
+    labels = manifest.get("labels")
+    spec: dict[str, Any] = {
+        "schema": "gcar-model/1",
+        "name": name,
+        "opset": OPSET,
+        "ir_version": IR_VERSION,
+        "precision": "float32",
+        "training": manifest,
+        "license": "Apache-2.0; trained on generated trees alone"
+        if not labels
+        else "that of the label volumes named in training.labels",
+        "parameters": sum(p.numel() for p in net.parameters()),
+    }
+    if isinstance(net, DeployedSparse):
+        return spec | {
+            "kind": "multi",
+            "inputs": {"view_features": VIEW_FEATURES, "levels": LEVELS, "net_pixels": 128},
+            "outputs": ["confidence", "offset_cells x y z", "radius_cells"],
+            "spacing_mm": [0.85, 1.5],
+            "geometry": "2 views or more, 25 .. 155 deg apart",
+        }
+    config = net.config
+    return spec | {
+        "kind": "single",
+        "inputs": {
+            "pixels": config.pixels,
+            "alpha": config.alpha,
+            "pose": config.pose,
+            "depth_pixels": DEPTH_PIXELS,
+            "offset_pixels": OFFSET_PIXELS,
+            "max_path_pixels": MAX_PATH_PIXELS,
+        },
+        "outputs": ["depth 0 .. 1 along the true ray", "offset_pixels u v w"],
+        "spacing_mm": [0.8, 1.6],
+        "geometry": "paper: SOD 1000 pixels, secondary 0; clinical: SOD 700 .. 820 mm, "
+        "primary within 60 deg, secondary within 35 deg",
+    }
+
+
+def finish(out: Path, spec: dict[str, Any]) -> dict[str, Any]:
+    """Clean the graph at ``out``, put its card into it, check it and write its spec.
+
+    Raises
+    ------
+    ModelError
+        The graph sums by scatter, which races, or weighs more than ``MAX_BYTES``.
+    """
+    import onnx
+
+    model = onnx.load(str(out), load_external_data=False)
     model.ir_version = IR_VERSION
     _refuse_scatters(model)
     for node in model.graph.node:
         # Where each node came from in the source is of no use to a host, and outweighs a graph.
         del node.metadata_props[:]
         node.doc_string = ""
-    manifest = json.loads((checkpoint.parent / "manifest.json").read_text())
-    spec = {
-        "schema": "gcar-model/1",
-        "name": out.stem,
-        "kind": "multi",
-        "inputs": {"view_features": VIEW_FEATURES, "levels": LEVELS, "net_pixels": 128},
-        "outputs": ["confidence", "offset_cells x y z", "radius_cells"],
-        "spacing_mm": [0.85, 1.5],
-        "opset": OPSET,
-        "ir_version": IR_VERSION,
-        "training": manifest,
-        "license": "Apache-2.0; trained on generated trees alone",
-    }
     del model.metadata_props[:]
     for key in ("schema", "name", "kind", "license"):
         entry = model.metadata_props.add()
@@ -111,71 +202,17 @@ def export_sparse(checkpoint: Path, out: Path, example) -> dict:
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(out))
     data = out.read_bytes()
-    spec["sha256"], spec["bytes"] = hashlib.sha256(data).hexdigest(), len(data)
-    spec["parameters"] = sum(p.numel() for p in net.parameters())
-    out.with_suffix(".json").write_text(json.dumps(spec, indent=1) + "\n")
+    if len(data) > MAX_BYTES:
+        raise ModelError(f"{out.name} weighs {len(data)} bytes; at most {MAX_BYTES} are allowed")
+    spec = {**spec, "sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+    out.with_suffix(".json").write_text(json.dumps(spec, indent=1) + "\n", encoding="utf-8")
     return spec
 
 
-def _refuse_scatters(model) -> None:
+def _refuse_scatters(model: Any) -> None:
     """Refuse a graph that sums by scatter: ONNX Runtime races on repeated indices."""
-    found = sorted({n.op_type for n in model.graph.node if n.op_type.startswith("Scatter")})
+    found: Sequence[str] = sorted(
+        {n.op_type for n in model.graph.node if n.op_type.startswith("Scatter")}
+    )
     if found:
-        raise ValueError(f"the graph holds {', '.join(found)}, which is not deterministic")
-
-
-@dataclasses.dataclass(frozen=True)
-class Parity:
-    """Largest difference between torch and ONNX Runtime over some inputs."""
-
-    inputs: int
-    worst: float
-    decisions_equal: float
-
-
-def parity(checkpoint: Path, model: Path, scenes) -> Parity:
-    """Compare both on the arrays of ``scenes`` (an iterable of Encoded)."""
-    import onnxruntime as ort
-
-    net = _Deployed(load_checkpoint(checkpoint)).eval()
-    session = ort.InferenceSession(str(model), providers=["CPUExecutionProvider"])
-    worst, equal, count, total = 0.0, 0, 0, 0
-    for encoded in scenes:
-        arrays = flat_inputs(encoded)
-        with torch.no_grad():
-            a = net(*[torch.from_numpy(x) for x in arrays]).numpy()
-        b = session.run(None, dict(zip(input_names(), arrays, strict=True)))[0]
-        worst = max(worst, float(np.abs(a - b).max() / max(float(np.ptp(a)), 1.0)))
-        equal += int(((a[:, 0] >= 0.5) == (b[:, 0] >= 0.5)).sum())
-        total += len(a)
-        count += 1
-    return Parity(count, worst, equal / max(total, 1))
-
-
-#: seed of the scenes that parity is checked on
-PARITY_SEED = 70_001
-
-
-def export_checked(checkpoint: Path, out: Path, scenes: int) -> Parity:
-    """Export, compare on generated scenes and refuse what differs.
-
-    Raises
-    ------
-    ModelError
-        The ONNX file says something else than the checkpoint; the file is taken away.
-    """
-    from gcar_deploy.errors import ModelError
-    from gcar_export.dataset import training_scene
-    from gcar_export.golden import write_golden
-
-    export_sparse(checkpoint, out, training_scene(PARITY_SEED, 0).encoded)
-    found = parity(checkpoint, out, (training_scene(PARITY_SEED, i).encoded for i in range(scenes)))
-    if found.worst > PARITY or found.decisions_equal < 0.9999:
-        for path in (out, out.with_suffix(".json")):
-            path.unlink(missing_ok=True)
-        raise ModelError(
-            f"{out.name} differs from its checkpoint by {found.worst:.1e} of the range "
-            f"(at most {PARITY:g}); {found.decisions_equal:.4%} of decisions equal"
-        )
-    write_golden(out, force=True)
-    return found
+        raise ModelError(f"the graph holds {', '.join(found)}, which is not deterministic")

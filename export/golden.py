@@ -9,21 +9,26 @@ import numpy as np
 from gcar_deploy.config import CandidateOptions, ModelLimits
 from gcar_deploy.errors import UsageError
 from gcar_deploy.predict.candidates import Candidates, visual_hull
-from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.center_map import net_picture
+from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.encoding import encode, flat_inputs, input_names
 from gcar_deploy.predict.golden import Golden, check_golden, golden_path
-from gcar_deploy.predict.model_spec import read_model
+from gcar_deploy.predict.model_spec import ModelFile, read_model
 from gcar_deploy.selftest import tiny_case
 
 #: points of the case: enough for every level and for rays of several points, small on disk
 POINTS = 500
 
 
-def golden_inputs() -> dict[str, np.ndarray]:
-    """Return the inputs of a part of the self-test's tree, by name."""
+def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
+    """Return the inputs that a part of the self-test's tree gives, by name."""
     angiograms, grid, _ = tiny_case()
     # path_length pictures: counts times mm per count
     views = [(a.carm, a.pixels * np.float32(a.intensity.mm_per_count)) for a in angiograms]
+    if model.kind == "single":
+        picture = net_picture(*views[0], int(model.inputs["pixels"]))
+        arrays = [picture.network_input(), picture.axes_input()]
+        return dict(zip(["picture", "axes"][: 1 + model.inputs["pose"]], arrays, strict=False))
     hull = visual_hull(views, grid, CandidateOptions())
     some = np.linspace(0, len(hull) - 1, 2 * POINTS).astype(np.int64)[:POINTS]
     part = Candidates(hull.index[some], hull.points_mm[some], hull.lattice)
@@ -49,8 +54,8 @@ def write_golden(model: Path, *, force: bool = False) -> Path:
         # A golden case of an earlier model would be refused with it.
         path.replace(old)
     try:
-        predictor = CenterPredictor(read_model(model), threads=1)
-        inputs = golden_inputs()
+        predictor = open_predictor(read_model(model), threads=1)
+        inputs = golden_inputs(predictor.model)
         answers = predictor.answers(inputs)
         golden = Golden(predictor.model.sha256, inputs, answers)
         path.write_bytes(golden.to_bytes())

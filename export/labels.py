@@ -8,9 +8,13 @@ that nothing downstream knows whether a tree came from ImageCAS (``*.label.nii.g
 from __future__ import annotations
 
 import dataclasses
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
+from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
 from scipy import ndimage
 
 from gcar_deploy.errors import UsageError
@@ -159,6 +163,13 @@ class LabelVolume:
         return dataclasses.replace(self, occupancy=np.ascontiguousarray(occupancy), grid=grid)
 
 
+#: what a damaged file raises inside NumPy, nibabel, zlib and zipfile
+_DAMAGE = (
+    ValueError, OSError, EOFError, KeyError, MemoryError, OverflowError, ZeroDivisionError,
+    np.linalg.LinAlgError, zlib.error, zipfile.BadZipFile, ImageFileError, HeaderDataError,
+)  # fmt: skip
+
+
 def read_label(path: str | Path) -> LabelVolume:
     """Read a label volume by its file name: .nii, .nii.gz, .nrrd, .mha, .mhd or ASOCA .npz.
 
@@ -175,11 +186,15 @@ def read_label(path: str | Path) -> LabelVolume:
         raise UsageError(f"no such label volume: {path}")
     name = path.name.lower()
     case = path.name.split(".")[0]
-    if name.endswith(".npz"):
-        label = _read_npz(path, case)
-    else:
-        array, affine = _read_any(path, name)
-        label = from_array(array > 0, affine, case)
+    try:
+        if name.endswith(".npz"):
+            label = _read_npz(path, case)
+        else:
+            array, affine = _read_any(path, name)
+            label = from_array(array > 0, affine, case)
+    except _DAMAGE as error:
+        reason = (str(error).splitlines() or [""])[0].replace(str(path), "it")[:200]
+        raise UsageError(f"{path}: cannot be read ({reason or type(error).__name__})") from None
     if not label.occupancy.any():
         raise UsageError(f"{path}: the label volume is empty")
     low, high = _occupied_box(label.occupancy)

@@ -1,7 +1,7 @@
-"""The rows of the tables: each method from a simulated case to a volume, settings in one place.
+"""The rows of the tables: each method from a simulated case to a volume.
 
-Everything but the baselines goes through the runtime's own ``Engine``, exactly as a host
-program would use it.
+What a row is, and its settings, stand in ``method_settings``. Everything but the baselines
+goes through the runtime's own ``Engine``, exactly as a host program would use it.
 """
 
 from __future__ import annotations
@@ -9,32 +9,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gcar_deploy.config import RunOptions
-from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.errors import GcarError, ModelError, UsageError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Image, Volume
+from gcar_export.method_settings import FBP_PAPER, METHODS, RUNTIME_ROWS, MethodSettings
 from gcar_export.protocols import Case
-
-#: method -> (predictor, refiner) of the runtime.
-RUNTIME_METHODS: Mapping[str, tuple[str, str]] = {
-    "hull": ("none", "none"),
-    "hull+paper": ("none", "paper"),
-    "hull+tube": ("none", "tube"),
-    "single": ("single", "none"),
-    "single+paper": ("single", "paper"),
-    "single+tube": ("single", "tube"),
-    "multi": ("multi", "none"),
-    "multi+paper": ("multi", "paper"),
-    "multi+tube": ("multi", "tube"),
-}
-#: what the runtime does when asked for nothing in particular.
-OURS = "ours"
-BASELINES = ("fdk", "sart", "visual_hull")
-METHODS = (OURS, *RUNTIME_METHODS, *BASELINES)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +30,8 @@ class Solved:
     Attributes
     ----------
     volume : (nx, ny, nz) float32 on the case's grid, or None if there is none
-    seconds : stage -> wall-clock seconds; ``total`` among them
+    seconds : stage -> wall-clock seconds; ``total`` among them, and ``cpu``, the CPU seconds of
+        all threads, which tell more than the clock on a machine that others use
     gaussians : number of Gaussians, None where the method has none
     status : ``ok``, ``degraded``, ``refused``, ``failed``
     sentence : why
@@ -57,7 +44,7 @@ class Solved:
     sentence: str
 
 
-def solve(case: Case, method: str) -> Solved:
+def solve(case: Case, method: str, settings: MethodSettings | None = None) -> Solved:
     """Run one method on one case.
 
     A case that the method refuses or fails on is a result with a status, not an exception.
@@ -66,43 +53,68 @@ def solve(case: Case, method: str) -> Solved:
     ------
     UsageError
         On an unknown method.
+    ModelError
+        The method's model is missing.
     """
+    settings = settings or MethodSettings()
     if method not in METHODS:
         raise UsageError(f"method {method!r} is none of {', '.join(METHODS)}")
-    start = time.perf_counter()
+    clock = _Clock()
     try:
-        if method in BASELINES:
-            # Importing itk takes seconds: before the clock starts.
-            run = _baseline(method)
-            start = time.perf_counter()
-            volume = run(case)
-            total = time.perf_counter() - start
-            return Solved(
-                volume=volume, seconds={"total": total}, gaussians=None, status="ok", sentence=""
-            )
-        return _runtime(case, run_options(method))
+        if method in RUNTIME_ROWS:
+            options = settings.run_options(method)
+            return _runtime(case, options, swapped=RUNTIME_ROWS[method].swapped)
+        _warm_up(method)
+        clock = _Clock()
+        if method == FBP_PAPER:
+            volume, gaussians, sentence = _fbp_paper(case, settings)
+        else:
+            volume, gaussians, sentence = _baseline(case, method, settings), None, ""
+        return Solved(
+            volume=volume,
+            seconds=clock.read(),
+            gaussians=gaussians,
+            status="ok",
+            sentence=sentence,
+        )
+    except ModelError:
+        raise
     except GcarError as error:
-        status = "refused" if error.exit_code == 6 else "failed"
         return Solved(
             volume=None,
-            seconds={"total": time.perf_counter() - start},
+            seconds=clock.read(),
             gaussians=None,
-            status=status,
+            status="refused" if error.exit_code == 6 else "failed",
             sentence=str(error),
         )
 
 
-def run_options(method: str) -> RunOptions:
-    """Return the runtime's options for a method of ``RUNTIME_METHODS`` or ``OURS``."""
-    options = RunOptions()
-    if method == OURS:
-        return options
-    predictor, refiner = RUNTIME_METHODS[method]
-    return dataclasses.replace(
-        options,
-        predict=dataclasses.replace(options.predict, predictor=predictor),
-        refine=dataclasses.replace(options.refine, refiner=refiner),
-    )
+def check_models(methods: Sequence[str], settings: MethodSettings) -> None:
+    """Load what the methods need, before any work is done.
+
+    Raises
+    ------
+    ModelError
+        A method's model is missing or altered; the message names the method.
+    """
+    for method in methods:
+        if method in RUNTIME_ROWS:
+            try:
+                _session(settings.run_options(method))
+            except ModelError as error:
+                raise ModelError(f"method {method}: {error}") from None
+
+
+class _Clock:
+    """Wall-clock and CPU seconds since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self) -> dict[str, float]:
+        """Return ``total`` and ``cpu``."""
+        wall, cpu = time.perf_counter() - self._wall, time.process_time() - self._cpu
+        return {"total": wall, "cpu": cpu}
 
 
 @dataclasses.dataclass(eq=False)
@@ -115,25 +127,33 @@ class _Session:
 
 @functools.cache
 def _session(options: RunOptions) -> _Session:
-    """One session per set of options and process."""
+    """One session per set of options and process.
+
+    Without its model the runtime falls back to the hull; a row must never do so unsaid.
+    """
     from gcar_deploy.engine import Engine
 
-    return _Session(Engine(options=options))
+    engine = Engine(options=options)
+    predictor = options.predict.predictor
+    if predictor != "none" and engine.model is None:
+        raise ModelError(f"predictor {predictor} has no model in this version")
+    return _Session(engine)
 
 
-def _runtime(case: Case, options: RunOptions) -> Solved:
+def _runtime(case: Case, options: RunOptions, *, swapped: bool) -> Solved:
     session = _session(options)
     angiograms, grid = case.angiograms(), case.grid
+    if swapped:
+        angiograms = angiograms[::-1]
     if not session.warm:
         # Times are those of a warm session: model loaded, modules imported.
-        session.engine.reconstruct(angiograms, grid)
+        session.engine.warmup()
         session.warm = True
-    start = time.perf_counter()
+    clock = _Clock()
     result = session.engine.reconstruct(angiograms, grid)
-    total = time.perf_counter() - start
     return Solved(
         volume=result.volume,
-        seconds={**result.seconds, "total": total},
+        seconds={**result.seconds, **clock.read()},
         gaussians=int(result.counts["gaussians"]),
         status=result.quality.status,
         sentence=result.quality.sentence,
@@ -158,19 +178,80 @@ def path_lengths(case: Case) -> list[Image]:
     return out
 
 
-def _baseline(method: str) -> Callable[[Case], Volume]:
+def voxel_sized(case: Case) -> tuple[list[Image], list[CArm]]:
+    """Path lengths and views with pixels of about a voxel at the isocentre, never finer ones.
+
+    All views shrink alike, so that pictures of one size stay of one size.
+    """
+    from gcar_deploy.imaging.resample import area_average
+
+    pictures, carms = path_lengths(case), case.scene_carms
+    finest = float(np.min(case.grid.spacing_mm))
+    scale = max(carm.pixel_at_isocenter_mm for carm in carms) / finest
+    if scale >= 1:
+        return pictures, carms
+    sizes = [tuple(max(round(n * scale), 1) for n in picture.shape) for picture in pictures]
+    return (
+        [area_average(picture, *size) for picture, size in zip(pictures, sizes, strict=True)],
+        [carm.resized(*size) for carm, size in zip(carms, sizes, strict=True)],
+    )
+
+
+@functools.cache
+def _warm_up(method: str) -> None:
+    """Load what takes seconds to load, once per process, before the clock starts.
+
+    itk loads its filters when they are first made, so a tiny case is run for that.
+    """
+    if method == "nerp":
+        import torch  # noqa: F401
+    elif method != "visual_hull":
+        from gcar_export.baselines.fdk import fdk
+        from gcar_export.baselines.sart import SartOptions, sart
+
+        grid = Grid(center_mm=(0, 0, 0), size_mm=(8, 8, 8), shape=(8, 8, 8))
+        carm = CArm(
+            primary_angle_deg=0, secondary_angle_deg=0, sod_mm=750, sdd_mm=1000, rows=8,
+            columns=8, pixel_spacing_mm=(1.5, 1.5),
+        )  # fmt: skip
+        tiny = [np.ones((8, 8), np.float32)] * 2, [carm, carm.turned(90.0)], grid
+        if method == "sart":
+            sart(*tiny, SartOptions(iterations=1))
+        else:
+            fdk(*tiny)
+
+
+def _baseline(case: Case, method: str, settings: MethodSettings) -> Volume:
+    if method == "nerp":
+        from gcar_export.baselines.nerp import nerp
+
+        return nerp(*voxel_sized(case), case.grid, settings.nerp)
+    if method == "sart":
+        from gcar_export.baselines.sart import sart
+
+        return sart(*voxel_sized(case), case.grid, settings.sart)
+    given = path_lengths(case), case.scene_carms, case.grid
     if method == "visual_hull":
-        return _visual_hull
+        from gcar_export.baselines.visual_hull import visual_hull
+
+        return visual_hull(*given, settings.hull_path_mm)
     from gcar_export.baselines.fdk import fdk
-    from gcar_export.baselines.sart import sart
-    from gcar_export.rtk_geometry import rtk
 
-    rtk()
-    solver = fdk if method == "fdk" else sart
-    return lambda case: solver(path_lengths(case), case.scene_carms, case.grid)
+    return fdk(*given, settings.fdk)
 
 
-def _visual_hull(case: Case) -> Volume:
-    from gcar_export.baselines.visual_hull import visual_hull
+def _fbp_paper(case: Case, settings: MethodSettings) -> tuple[Volume, int, str]:
+    from gcar_deploy.gaussians.voxelize import voxelize
+    from gcar_deploy.imaging.extract import extract_vessels
+    from gcar_deploy.refine.paper import refine_paper
+    from gcar_export.baselines.fbp_gaussians import fbp_centers
+    from gcar_export.baselines.fdk import fdk
 
-    return visual_hull(path_lengths(case), case.scene_carms, case.grid)
+    given = path_lengths(case), case.scene_carms
+    start = fdk(*given, case.grid, settings.fdk)
+    centers = fbp_centers(start, case.grid, *given, settings.fbp_gaussians)
+    views = [extract_vessels(a, settings.run.imaging) for a in case.angiograms()]
+    options = settings.fbp_paper_options()
+    fit = refine_paper(centers, views, options)
+    volume = np.clip(voxelize(fit.gaussians, case.grid), 0.0, 1.0)
+    return volume, len(fit.gaussians), f"{fit.steps} of at most {options.steps} steps"

@@ -131,7 +131,7 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
         tree, carms, new, grid = label.roughly_centred(), *_paper_geometry(views)
     else:
         tree = label.left_right()[0].centred()
-        carms, new, grid = _clinical_geometry(views)
+        carms, new, grid = clinical_geometry(views)
     truly = _as_it_was if protocol == "moved" else _as_told
     paths = [truly(tree, carm, index) for index, carm in enumerate(carms)]
     if protocol == "raw":
@@ -207,7 +207,8 @@ def _paper_geometry(views: int) -> tuple[list[CArm], list[CArm], Grid]:
     )
 
 
-def _clinical_geometry(views: int) -> tuple[list[CArm], list[CArm], Grid]:
+def clinical_geometry(views: int) -> tuple[list[CArm], list[CArm], Grid]:
+    """Return views, new views and grid of the clinical set-up."""
     grid = Grid(center_mm=(0, 0, 0), size_mm=(128, 128, 128), shape=(128, 128, 128))
 
     def carm(primary: float, secondary: float, sdd: float) -> CArm:

@@ -1,7 +1,8 @@
 """The folder of a training run, shared by every network.
 
 ``checkpoint.safetensors`` (weights, optimiser state, step), ``manifest.json`` (what was trained,
-on what, with what), ``log.csv`` (one row per kind of scene and validation) and ``curve.png``.
+on what, with what), ``log.csv`` (one row per kind of scene and validation) and ``curve.png``; some
+trainings also keep ``best.safetensors``, the checkpoint that did best on held-out generated scenes.
 Each file is replaced whole, so an interruption at any moment leaves a folder to go on from.
 """
 
@@ -11,6 +12,7 @@ import csv
 import json
 import os
 import platform
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -45,7 +47,7 @@ class RunFolder:
 
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
         self.path = path
-        self.manifest = {"schema": SCHEMA, **manifest}
+        self.manifest: dict[str, Any] = {"schema": SCHEMA, **manifest}
         self._check_same()
         path.mkdir(parents=True, exist_ok=True)
 
@@ -69,6 +71,8 @@ class RunFolder:
                     f"{self.path} holds a run with {_shown(key, before.get(key))}, this one has "
                     f"{_shown(key, now.get(key))}; give another --out, or the same {key}"
                 )
+        if "best" in before:
+            self.manifest["best"] = before["best"]
 
     def resume(self, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> int:
         """Load weights and optimiser state if there are any; return the step reached."""
@@ -108,9 +112,22 @@ class RunFolder:
             "numpy": np.__version__,
             "python": platform.python_version(),
         }
+        os.replace(partial, self.checkpoint)
+        self._write_manifest()
+
+    def keep_best(self, step: int, error: float, scores: Mapping[str, Any]) -> None:
+        """Copy the checkpoint just saved to best.safetensors if no earlier error was lower."""
+        if error >= self.manifest.get("best", {"error": np.inf})["error"]:
+            return
+        partial = self.path / "best.tmp"
+        shutil.copy(self.checkpoint, partial)
+        os.replace(partial, self.path / "best.safetensors")
+        self.manifest["best"] = {"step": step, "error": error, "validation": dict(scores)}
+        self._write_manifest()
+
+    def _write_manifest(self) -> None:
         text = json.dumps(self.manifest, indent=1) + "\n"
         (self.path / "manifest.tmp").write_text(text, encoding="utf-8")
-        os.replace(partial, self.checkpoint)
         os.replace(self.path / "manifest.tmp", self.path / "manifest.json")
 
     def log(self, step: int, loss: float, scores: Mapping[str, Mapping[str, float]]) -> None:

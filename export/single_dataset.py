@@ -1,7 +1,8 @@
 """Training pictures of the single-view predictor: path lengths in, true depth and centreline.
 
-Picture i of seed s is a function of (s, i) alone. Depth is that of the true cone-beam ray: the
-middle of its longest stretch of vessel, at the pixel of each cell that shows most of it.
+Views are the paper's two and six that are usual in practice: monocular depth has to be learned per
+direction. Picture i of seed s is a function of (s, i) alone. Depth is that of the true cone-beam
+ray: the middle of its longest stretch of vessel, at the pixel of each cell that shows most of it.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def training_pictures(
     options = options or SceneOptions()
     for attempt in range(20):
         rng = np.random.default_rng([seed, i, attempt, 1])
-        drawn = examination(rng, options, labels)
+        drawn = examination(rng, options, labels, usual=True)
         if drawn is None:
             continue
         exact = rng.random() < options.exact_share

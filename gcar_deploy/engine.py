@@ -6,13 +6,14 @@ import dataclasses
 import hashlib
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
@@ -20,10 +21,17 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.center_predictor import CenterPredictor
-from gcar_deploy.predict.model_spec import read_model, shipped_model_path
+from gcar_deploy.predict.center_predictor import Predictor, open_predictor
+from gcar_deploy.predict.model_spec import (
+    SEGMENTER_MODEL,
+    SHIPPED,
+    read_model,
+    shipped_model_path,
+)
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
 
@@ -33,6 +41,7 @@ _log = logging.getLogger(__name__)
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
 #: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
 Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
+SEGMENTERS = ("classic", "net", "auto")
 PREDICTORS = ("auto", "multi", "single", "none")
 _DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 
@@ -50,7 +59,8 @@ class Engine:
     Raises
     ------
     ModelError
-        The model is missing, altered or unfit.
+        The model given is missing, or a model is altered or unfit. Where no model is given and
+        none is installed, the visual hull is thinned instead, and every result says so.
     """
 
     def __init__(
@@ -65,7 +75,11 @@ class Engine:
         if threads is not None and threads < 1:
             raise UsageError(f"threads = {threads} must be 1 or more")
         self.threads = threads or min(os.cpu_count() or 1, 4)
-        self._predictor = _load(model, self.options.predict.predictor, self.threads, session)
+        self._predictor = _load(model, self.options.predict, self.threads, session)
+        self._notes: tuple[str, ...] = ()
+        if self._predictor is None and self.options.predict.predictor != "none":
+            self._notes = (_missing(self.options.predict.predictor),)
+        self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
 
     @property
     def model(self) -> Mapping[str, str] | None:
@@ -91,6 +105,7 @@ class Engine:
         views: Sequence[Picture],
         geometry: Geometry | None = None,
         *,
+        masks: Mapping[int, str | Path | np.ndarray] | None = None,
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
         cancel: Callable[[], bool] | None = None,
@@ -101,9 +116,13 @@ class Engine:
         ----------
         views : 2 or more pictures, in the order of the geometry's views
         geometry : where they were taken from; None where DICOM headers say it
+        masks : number of the view, from 1 -> vessel mask (picture of its size), which wins over
+            what would be found in the pixels
         on_progress : called with (stage, share of the work done) from the calling thread
-        deadline_s : seconds after which the refinement ends with what it has (``degraded``)
-        cancel : callable, for instance ``threading.Event().is_set``
+        deadline_s : seconds that the call may take: the refinement ends early enough with what
+            it has (``degraded``); CancelledError if there is nothing to refine by then
+        cancel : callable, for instance ``threading.Event().is_set``; also asked from another
+            thread while the model runs; ends within one step of the refinement
 
         Raises
         ------
@@ -111,17 +130,22 @@ class Engine:
         """
         if deadline_s is not None and not deadline_s > 0:
             raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
+        started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
+        angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
+        notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
         result = reconstruct(
             angiograms,
             grid,
             self.options,
             predictor=self._predictor,
+            segmenter=self._segmenter,
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,
+            used_s=time.perf_counter() - started,
         )
-        return dataclasses.replace(result, notes=(*notes, *result.notes))
+        return dataclasses.replace(result, notes=(*notes, *self._notes, *result.notes))
 
 
 def prepare(
@@ -167,7 +191,7 @@ def prepare(
             run = read_run(picture, options.dicom, frames.pop(0))
             carm = _matched(view, run.pixels.shape, notes)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
-            notes += run.notes
+            notes += [f"view {view.id}: {note}" for note in run.notes]
             continue
         if isinstance(picture, np.ndarray):
             pixels, depth, sha256 = _from_array(view.id, picture, options.imaging.limits)
@@ -185,6 +209,58 @@ def prepare(
             )
         )
     return angiograms, scene.volume_grid(), notes
+
+
+def with_masks(
+    angiograms: Sequence[Angiogram],
+    masks: Mapping[int, str | Path | np.ndarray],
+    limits: PictureLimits,
+) -> list[Angiogram]:
+    """Give pictures the user's vessel masks.
+
+    Raises
+    ------
+    UsageError
+        There is no view of that number.
+    ImageError
+        A mask cannot be read, has another size than its picture, or no vessel.
+    """
+    out = list(angiograms)
+    for number, given in masks.items():
+        if not 1 <= number <= len(out):
+            raise UsageError(f"mask {number}: there are views 1 .. {len(out)}")
+        array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
+        shape = out[number - 1].pixels.shape
+        if array.shape != shape:
+            raise ImageError(
+                f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
+            )
+        mask = array > 0.5 * float(array.max())
+        if not mask.any() or mask.mean() > 0.9:
+            raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
+        out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)
+    return out
+
+
+def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
+    """Load the network that finds vessels where ``wanted`` needs it.
+
+    Raises
+    ------
+    UsageError
+        ``wanted`` is unknown.
+    ModelError
+        ``net`` is wanted and the network is missing or altered.
+    """
+    if wanted not in SEGMENTERS:
+        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(SEGMENTERS)}")
+    path = shipped_model_path(SEGMENTER_MODEL)
+    if wanted == "classic" or (path is None and wanted == "auto"):
+        return None
+    if path is None:
+        raise ModelError("no segmentation network is installed with this version; use classic")
+    model = read_model(path, wanted=SEGMENTER_INPUT)
+    return Segmenter(model.data, model.name, threads=threads)
 
 
 def _from_headers(
@@ -258,21 +334,29 @@ def _scene(geometry: Geometry) -> Scene:
 
 
 def _load(
-    model: str | Path | None, wanted: str, threads: int, session: Any
-) -> CenterPredictor | None:
+    model: str | Path | None, options: PredictOptions, threads: int, session: Any
+) -> Predictor | None:
+    wanted = options.predictor
     if wanted not in PREDICTORS:
         raise UsageError(f"predictor = {wanted!r} is none of {', '.join(PREDICTORS)}")
     if wanted == "none":
         if model is not None:
             raise UsageError("predictor none uses no model; leave the model away")
         return None
-    if wanted == "single":
-        # The single-view predictor has other inputs and no shipped model yet.
-        raise ModelError("predictor single has no model in this version; use multi or none")
-    path = shipped_model_path() if model is None else Path(model)
+    path = shipped_model_path(_shipped(wanted)) if model is None else Path(model)
     if path is None:
-        if wanted == "multi":
-            raise ModelError("no model is installed with this version; give one, or use none")
-        _log.info("no model is installed: the visual hull is thinned instead")
+        _log.info("%s", _missing(wanted))
         return None
-    return CenterPredictor(read_model(path), threads=threads, session=session)
+    file = read_model(path, options.limits)
+    if wanted not in ("auto", file.kind):
+        raise ModelError(f"model {file.name} is of kind {file.kind}, not {wanted}")
+    return open_predictor(file, threads=threads, session=session)
+
+
+def _shipped(wanted: str) -> str:
+    """Name of the model that a predictor uses unless one is given."""
+    return SHIPPED["multi" if wanted == "auto" else wanted]
+
+
+def _missing(wanted: str) -> str:
+    return f"{_shipped(wanted)}.onnx is not installed: the visual hull was thinned instead"

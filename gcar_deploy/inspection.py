@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import RunOptions
-from gcar_deploy.engine import prepare
+from gcar_deploy.engine import load_segmenter, prepare
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
@@ -92,9 +92,9 @@ def inspect_files(
             )
         found.silent += silent_errors(carms)
         found.warnings += check_views(angiograms, options.quality)
-        views = []
+        views, segmenter = [], load_segmenter(options.imaging.segmenter)
         for entry, angiogram in zip(found.views, angiograms, strict=True):
-            view = extract_vessels(angiogram, options.imaging)
+            view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())
             views.append(view)
         found.warnings += _consistency(found, views, options)

@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 
 from gcar_deploy.config import QualityOptions
-from gcar_deploy.errors import RefusedError
+from gcar_deploy.errors import GeometryError, RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.consistency import match_rate
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.tree.lumen import foreshortening
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Mask, Scalars
 
@@ -33,9 +35,13 @@ class ViewQuality:
     view_id : str
     name : str, clinical words, for instance ``'RAO 30 CAU 20'``
     coverage : share of the picture's skeleton near the reprojected centreline
-    support : share of the reprojected centreline (inside the picture) near the skeleton
+    support : share of the reprojected centreline (inside the picture) near the vessel mask; not
+        its skeleton, which runs between two vessels that lie side by side
     distance_mm : mean distance of the skeleton from the centreline, at the isocentre
     overlap : Dice coefficient of vessel mask and reprojected lumen
+    coverage_2px : as ``coverage``, but within 2 pixels of the picture, whatever their size
+    match_rate : share of the skeleton with a possible partner in the view that sees best across
+    foreshortening : share of the tree's length that this view loses by looking along it
 
     Undefined figures are None (no skeleton, or no tree in the picture).
     """
@@ -46,6 +52,9 @@ class ViewQuality:
     support: float | None
     distance_mm: float | None
     overlap: float | None
+    coverage_2px: float | None = None
+    match_rate: float | None = None
+    foreshortening: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -145,6 +154,30 @@ def check_consistency(
     return findings
 
 
+def check_poses(
+    views: Sequence[VesselImage],
+    corrections: Sequence[tuple[float, float]],
+    options: QualityOptions,
+) -> list[str]:
+    """Judge the estimated corrections between the runs.
+
+    Parameters
+    ----------
+    views : V vessel images
+    corrections : (V,) shift in mm and larger turn in deg of each view
+    """
+    findings = []
+    for view, (shift, turn) in zip(views, corrections, strict=True):
+        if shift > options.good_shift_mm or turn > options.good_turn_deg:
+            findings.append(
+                f"view {view.view_id} had to be moved by {shift:.1f} mm and turned by "
+                f"{turn:.1f} deg to agree (up to {options.good_shift_mm:g} mm and "
+                f"{options.good_turn_deg:g} deg are usual): the same move within the plane of "
+                "the beams would leave no trace"
+            )
+    return findings
+
+
 def check_candidates(count: int, lattice: Grid, options: QualityOptions) -> None:
     """Refuse where hardly a point is seen as vessel by all views.
 
@@ -211,7 +244,7 @@ def assess(
     judged = []
     doubtful = (disagreement or 0.0) > _disagreement_limits(views, options)[0]
     for view, inside in zip(views, lumen, strict=True):
-        one = view_quality(tree, view, inside, options)
+        one = view_quality(tree, view, inside, options, _across(view, views))
         judged.append(one)
         if doubtful and (one.coverage or 0.0) < options.good_coverage:
             raise RefusedError(
@@ -247,22 +280,33 @@ def _sentence(findings: Sequence[str], count: int) -> str:
     return findings[0][0].upper() + findings[0][1:] + more + "."
 
 
+def _across(view: VesselImage, views: Sequence[VesselImage]) -> VesselImage | None:
+    """Return the other view whose direction is nearest to 90 deg from this one's."""
+    others = [other for other in views if other is not view]
+    return min(others, key=lambda v: abs(separation_deg(view.carm, v.carm) - 90.0), default=None)
+
+
 def view_quality(
-    tree: Tree, view: VesselImage, lumen: Mask, options: QualityOptions
+    tree: Tree,
+    view: VesselImage,
+    lumen: Mask,
+    options: QualityOptions,
+    partner: VesselImage | None = None,
 ) -> ViewQuality:
     """Compare one picture with the reprojected tree; see ``ViewQuality``."""
     pixel_mm = view.carm.pixel_at_isocenter_mm
     near_px = _near_px(view.carm, options)
     line = centreline_mask(tree, view.carm)
     seen = view.skeleton & view.valid
-    coverage = support = distance = None
+    coverage = support = distance = strict = None
     if seen.any() and line.any():
         gap = _distance_to(line)[seen]
         coverage = float((gap <= near_px).mean())
         distance = float(gap.mean() * pixel_mm)
+        strict = float((gap <= 2.0).mean())
         visible = line & view.valid
         if visible.any():
-            support = float((_distance_to(view.skeleton)[visible] <= near_px).mean())
+            support = float((_distance_to(view.mask)[visible] <= near_px).mean())
     total = int(lumen.sum()) + int(view.mask.sum())
     return ViewQuality(
         view_id=view.view_id,
@@ -271,7 +315,27 @@ def view_quality(
         support=support,
         distance_mm=distance,
         overlap=2.0 * int((lumen & view.mask).sum()) / total if total else None,
+        coverage_2px=strict,
+        match_rate=None if partner is None else _match_rate(view, partner),
+        foreshortening=_hidden(tree, view.carm),
     )
+
+
+def _hidden(tree: Tree, carm: CArm) -> float | None:
+    """Share of the whole tree's length that a view hides; None without a tree."""
+    total = tree.length_mm
+    if not total > 0:
+        return None
+    return sum(foreshortening(b, carm) * b.length_mm for b in tree.branches) / total
+
+
+def _match_rate(view: VesselImage, partner: VesselImage) -> float | None:
+    a, b = (np.argwhere(v.skeleton & v.valid)[:, ::-1].astype(np.float64) for v in (view, partner))
+    near_mm = 2.0 * max(view.carm.pixel_at_isocenter_mm, partner.carm.pixel_at_isocenter_mm)
+    try:
+        return match_rate(view.carm, partner.carm, a, b, near_mm)
+    except GeometryError:  # exactly opposite: no epipolar planes
+        return None
 
 
 def unexplained(tree: Tree, view: VesselImage, options: QualityOptions) -> Mask:

@@ -14,18 +14,21 @@ import numpy as np
 
 from gcar_deploy import alternatives, quality
 from gcar_deploy.config import RunOptions
-from gcar_deploy.errors import NumericalError, UsageError
+from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.candidates import cubic_lattice, visual_hull
-from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.decide import decide
-from gcar_deploy.predict.encoding import encode
+from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
+from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose, estimate_poses
 from gcar_deploy.refine.refine import Refined, refine, refined_volume
 from gcar_deploy.refine.tube_model import footprint, tubes_of
@@ -39,6 +42,9 @@ STAGES = (
     ("vessels", 3.0), ("pose", 2.0), ("candidates", 1.0), ("centers", 2.0), ("refine", 6.0),
     ("tree", 1.0), ("quality", 0.5),
 )  # fmt: skip
+#: what is kept of a deadline, as shares of the time that all before the refinement took: for what
+#: follows its last step (sigma, tree, volume, quality), for its start, and for a tree without it
+FINISH_SHARE, BEGIN_SHARE, UNREFINED_SHARE = 0.9, 0.5, 0.7
 _FALLBACK = "no model was used: depth was decided by thinning the visual hull"
 
 
@@ -47,10 +53,12 @@ def reconstruct(
     grid: Grid,
     options: RunOptions,
     *,
-    predictor: CenterPredictor | None = None,
+    predictor: Predictor | None = None,
+    segmenter: Segmenter | None = None,
     on_progress: OnProgress | None = None,
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
+    used_s: float = 0.0,
 ) -> Result:
     """Reconstruct the coronary tree that all views show.
 
@@ -59,10 +67,12 @@ def reconstruct(
     angiograms : 2 or more pictures with their C-arms
     grid : Grid of the volume that is asked for
     options : RunOptions
-    predictor : CenterPredictor, or None to thin the visual hull instead
+    predictor : of either kind, or None to thin the visual hull instead
+    segmenter : Segmenter, where ``options.imaging.segmenter`` asks for one
     on_progress : called with (stage, share of the work done)
     deadline_s : seconds after which the refinement ends with what it has
-    cancel : called often; True ends the work with CancelledError
+    cancel : called often, also from another thread; True ends the work with CancelledError
+    used_s : seconds that reading the pictures took, part of the deadline and of ``total``
 
     Raises
     ------
@@ -73,12 +83,17 @@ def reconstruct(
     """
     if len(angiograms) < 2:
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
-    watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel)
+    landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
+    watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
+                      used_s=used_s)  # fmt: skip
     findings = quality.check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        views = _vessels(angiograms, options, report)
+        views = _vessels(angiograms, options, segmenter, report, watch)
     with watch.stage("pose"):
         poses = poses_between(views, options)
+        findings += quality.check_poses(
+            views, [(p.shift_mm, p.turn_deg) for p in poses], options.quality
+        )
         findings += quality.check_consistency(
             views, [p.after for p in poses], options.quality, [p.partner for p in poses]
         )
@@ -88,23 +103,23 @@ def reconstruct(
         seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
         hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
+        watch.check()
         encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
-    told = None
     with watch.stage("centers"):
+        centers, told = _centers(predictor, hull, encoded, views, options, watch)
         if predictor is None:
-            centers = thin_hull(hull, encoded, options.candidates)
             findings.append(_FALLBACK)
-        else:
-            calibrated = all(view.calibrated for view in views)
-            centers = told = predictor.predict(hull, encoded)
-            centers = decide(centers, encoded, calibrated, options.decide)
     with watch.stage("refine") as report:
+        before_s = watch.elapsed_s
+        watch.require(UNREFINED_SHARE * before_s)
+        how = options.refine
+        if watch.left_s < (BEGIN_SHARE + FINISH_SHARE) * before_s:
+            how = dataclasses.replace(how, refiner="none")
+            findings.append("the deadline left no time to refine")
         refined = refine(
-            centers, views, options.refine, on_progress=report, should_stop=watch.should_stop,
-            tree_options=options.tree,
+            centers, views, how, on_progress=report, tree_options=options.tree,
+            should_stop=watch.leaving(FINISH_SHARE * before_s),
         )  # fmt: skip
-        if watch.cancelled:
-            watch.check()
         if refined.status == "failed":
             raise NumericalError("the refinement left the finite numbers")
         if refined.status == "stopped":
@@ -112,7 +127,9 @@ def reconstruct(
     with watch.stage("tree", keep_if_late=True):
         tree = _tree(refined, centers, options)
         quality.check_tree(tree, options.quality)
-        volume = refined_volume(refined, views, grid, options.refine)
+        if watch.cancelled:
+            watch.check()
+        volume = refined_volume(refined, views, grid, how)
     with watch.stage("quality", keep_if_late=True):
         lumen = [_lumen(tree, view, options) for view in views]
         worst = max(p.after for p in poses)
@@ -131,7 +148,7 @@ def reconstruct(
             "branches": len(tree.branches), "steps": refined.steps,
             "rejected_steps": refined.rejected_steps, "alternatives": len(open_),
         },
-        losses=tuple(refined.losses), predictor=centers.source, refiner=options.refine.refiner,
+        losses=tuple(refined.losses), predictor=centers.source, refiner=how.refiner,
         model=None if predictor is None
         else {"name": predictor.model.name, "sha256": predictor.model.sha256},
         notes=(), options=options,
@@ -144,12 +161,42 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
     return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
 
 
+def _centers(
+    predictor: Predictor | None,
+    hull: Candidates,
+    encoded: Encoded,
+    views: Sequence[VesselImage],
+    options: RunOptions,
+    watch: Stopwatch,
+) -> tuple[CenterPoints, CenterPoints | None]:
+    """Which of the hull's points are vessel, and what the multi-view predictor said of each."""
+    if predictor is None:
+        return thin_hull(hull, encoded, options.candidates), None
+    stop = watch.should_stop if watch.interruptible else None
+    try:
+        if isinstance(predictor, SingleViewPredictor):
+            alone = predictor.predict([(view.carm, view.path_mm) for view in views], stop)
+            single = options.predict.single
+            return merge_views(alone, hull, encoded, options.candidates, single), None
+        told = predictor.predict(hull, encoded, stop)
+    except CancelledError:
+        watch.check()
+        raise
+    calibrated = all(view.calibrated for view in views)
+    return decide(told, encoded, calibrated, options.decide), told
+
+
 def _vessels(
-    angiograms: Sequence[Angiogram], options: RunOptions, report: Callable[[float], None]
+    angiograms: Sequence[Angiogram],
+    options: RunOptions,
+    segmenter: Segmenter | None,
+    report: Callable[[float], None],
+    watch: Stopwatch,
 ) -> list[VesselImage]:
     views = []
     for angiogram in angiograms:
-        views.append(extract_vessels(angiogram, options.imaging))
+        watch.check()
+        views.append(extract_vessels(angiogram, options.imaging, segmenter))
         report(len(views) / len(angiograms))
     return views
 
@@ -163,7 +210,12 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
         fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
-    return estimate_poses([sampled_path(v, options.predict.min_cell_mm) for v in views], pose)
+    small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
+    marks = landmark_pixels(options.landmarks, [view.carm for view in views])
+    for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
+        scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
+        marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
+    return estimate_poses(small, pose, marks)
 
 
 def _posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -24,7 +24,9 @@ class Stopwatch:
         Every stage in order with its usual share of the time, for the progress.
     on_progress : callable (stage, fraction), optional
     deadline_s : float, optional
-        Seconds from now after which ``should_stop`` is true.
+        Seconds from the start after which ``should_stop`` is true.
+    used_s : float
+        Seconds that the caller has used up before.
     cancel : callable () -> bool, optional
     """
 
@@ -35,9 +37,10 @@ class Stopwatch:
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
         cancel: Callable[[], bool] | None = None,
+        used_s: float = 0.0,
     ) -> None:
         self.seconds: dict[str, float] = {}
-        self._started = time.perf_counter()
+        self._started = time.perf_counter() - used_s
         self._deadline_s = deadline_s
         self._cancel = cancel
         self._on_progress = on_progress
@@ -63,9 +66,40 @@ class Stopwatch:
         """Whether the caller wants out."""
         return self._cancel is not None and self._cancel()
 
+    @property
+    def interruptible(self) -> bool:
+        """Whether there is a deadline or a way to cancel at all."""
+        return self._deadline_s is not None or self._cancel is not None
+
     def should_stop(self) -> bool:
         """Whether an iteration should end with what it has."""
         return self.late or self.cancelled
+
+    @property
+    def left_s(self) -> float:
+        """Seconds until the deadline, below 0 after it; infinite without one."""
+        return float("inf") if self._deadline_s is None else self._deadline_s - self.elapsed_s
+
+    def leaving(self, reserve_s: float) -> Callable[[], bool]:
+        """Return a question for iterations: whether the deadline is ``reserve_s`` away or nearer.
+
+        Asking raises CancelledError once the caller has cancelled.
+        """
+
+        def should_stop() -> bool:
+            if self.cancelled:
+                self.check()
+            return self.left_s < reserve_s
+
+        return should_stop
+
+    def require(self, seconds: float) -> None:
+        """Raise CancelledError if cancelled, or if less than ``seconds`` are left."""
+        if self.cancelled or self.left_s < seconds:
+            self.check()
+            raise CancelledError(
+                f"the deadline of {self._deadline_s:g} s leaves no time for a result"
+            )
 
     def check(self) -> None:
         """Raise CancelledError if cancelled, or late; for stages without a usable half-result."""

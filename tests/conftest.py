@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import requirements_plugin
+
 
 def data_dir() -> Path:
     """Folder with the optional large data (environment variable GCAR_DATA), or skip."""
@@ -21,8 +23,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--run-benchmarks", action="store_true", help="run tests that measure time")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Requirements are judged where all reports meet: not in a process of pytest-xdist."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(requirements_plugin.RequirementsPlugin(config))
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip benchmarks unless they are asked for."""
+    """Let reports name their requirements; skip benchmarks unless they are asked for."""
+    requirements_plugin.name_requirements(items)
     if config.getoption("--run-benchmarks"):
         return
     skip = pytest.mark.skip(reason="needs --run-benchmarks")

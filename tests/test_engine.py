@@ -46,12 +46,79 @@ def test_arrays_with_a_scene_a_dict_or_a_file_give_one_result(case, engine, tmp_
         assert content(engine.reconstruct(arrays, geometry)) == whole
 
 
+@pytest.mark.req("REQ-36")
 def test_threads_share_one_engine_and_agree_to_the_byte(case, engine):
     angiograms, grid, _ = case
     alone = content(engine.reconstruct(angiograms, grid))
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
         runs = [pool.submit(engine.reconstruct, angiograms, grid) for _ in range(8)]
         assert {content(run.result()) for run in runs} == {alone}
+
+
+@pytest.mark.slow
+def test_eight_threads_share_the_shipped_model_to_the_byte(case, request):
+    """40 calls a thread with --run-benchmarks, 3 without."""
+    angiograms, grid, _ = case
+    calls = 40 if request.config.getoption("--run-benchmarks") else 3
+    engine = Engine(threads=1)
+    alone = content(engine.reconstruct(angiograms, grid))
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        runs = [pool.submit(engine.reconstruct, angiograms, grid) for _ in range(8 * calls)]
+        assert {content(run.result()) for run in runs} == {alone}
+
+
+def test_an_existing_session_is_used_as_it_is(case):
+    ort = pytest.importorskip("onnxruntime")
+    from gcar_deploy.predict.model_spec import shipped_model_path
+
+    angiograms, grid, _ = case
+    ran = []
+
+    class Session(ort.InferenceSession):
+        def run(self, *arguments):
+            ran.append(self)
+            return super().run(*arguments)
+
+    session = Session(str(shipped_model_path()), providers=["CPUExecutionProvider"])
+    engine = Engine(session=session)
+    assert content(engine.reconstruct(angiograms, grid)) == content(
+        Engine().reconstruct(angiograms, grid)
+    )
+    assert ran and set(map(id, ran)) == {id(session)}
+
+
+def test_a_running_inference_is_cut(case, monkeypatch):
+    """Asked from another thread, since inference holds the calling one."""
+    from gcar_deploy.predict import center_predictor
+
+    monkeypatch.setattr(center_predictor, "WATCH_S", 1e-4)
+    angiograms, grid, _ = case
+    stage, askers = [""], set()
+
+    def cancel():
+        if stage[0] == "centers":
+            askers.add(threading.current_thread().name)
+        return "gcar-watch" in askers
+
+    with pytest.raises(CancelledError, match="by the caller"):
+        Engine(threads=1).reconstruct(
+            angiograms, grid, on_progress=lambda s, _: stage.__setitem__(0, s), cancel=cancel
+        )
+    assert "gcar-watch" in askers and stage[0] == "centers"
+    assert not any(t.name == "gcar-watch" for t in threading.enumerate())
+
+
+def test_the_process_is_left_as_it_was(case, engine):
+    import os
+
+    import cv2
+
+    angiograms, grid, _ = case
+    before = dict(os.environ), os.getcwd(), cv2.getNumThreads(), np.geterr()
+    engine.reconstruct(angiograms, grid, deadline_s=60.0, cancel=lambda: False)
+    after = dict(os.environ), os.getcwd(), cv2.getNumThreads(), np.geterr()
+    assert before == after
+    assert not any(t.name == "gcar-watch" for t in threading.enumerate())
 
 
 def test_progress_rises_from_stage_to_stage(case, engine):
@@ -63,6 +130,7 @@ def test_progress_rises_from_stage_to_stage(case, engine):
     assert {"vessels", "candidates", "refine", "tree"} <= {stage for stage, _ in seen}
 
 
+@pytest.mark.req("REQ-21")
 def test_cancel_ends_within_a_stage(case, engine):
     angiograms, grid, _ = case
     flag = threading.Event()
@@ -78,6 +146,7 @@ def test_cancel_ends_within_a_stage(case, engine):
     assert "quality" not in stages
 
 
+@pytest.mark.req("REQ-21")
 def test_a_deadline_before_any_result_is_an_error(case, engine):
     angiograms, grid, _ = case
     with pytest.raises(CancelledError, match="deadline"):
@@ -95,6 +164,7 @@ def test_result_as_json_and_folder(case, engine, tmp_path):
     )
 
 
+@pytest.mark.req("REQ-36")
 def test_nothing_is_printed(case, engine, capfd):
     angiograms, grid, _ = case
     engine.warmup()

@@ -174,6 +174,7 @@ def _skeletons(a, b):
 
 
 @pytest.mark.parametrize(("name", "truth", "predicted", "reason"), TABLE)
+@pytest.mark.req("REQ-42")
 def test_undefined_is_none_with_a_reason(name, truth, predicted, reason):
     b = None if predicted is None else predicted.astype(float)
     assert CALLS[name](truth.astype(float), b) == Measure(None, reason)

@@ -16,6 +16,7 @@ from gcar_deploy.quality import (
     best_separation,
     check_candidates,
     check_consistency,
+    check_poses,
     check_tree,
     check_views,
     view_quality,
@@ -43,6 +44,7 @@ def turned(angiogram, primary):
      (90, "ok"), (154, "ok"), (156, "degraded"), (174.5, "degraded"), (175.5, "refused"),
      (180, "refused")],
 )  # fmt: skip
+@pytest.mark.req("REQ-13")
 def test_separation(case, second, outcome):
     pair = [turned(case[0][0], 0.0), turned(case[0][1], second)]
     if outcome == "refused":
@@ -65,6 +67,7 @@ def test_the_same_picture_twice(case):
         check_views(pair, OPTIONS)
 
 
+@pytest.mark.req("REQ-13")
 def test_contradiction(case):
     views = case[1]
     assert check_consistency(views, [0.0, OPTIONS.good_disagreement], OPTIONS) == []
@@ -132,3 +135,20 @@ def test_doubtful_views_that_no_tree_explains_contradict(case):
         assess(part, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS)
     assert assess(part, views, masks, [], OPTIONS.good_disagreement, OPTIONS).status == "degraded"
     assert assess(tree, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS).status == "ok"
+
+
+def test_a_large_correction_between_the_runs_is_degraded(case):
+    views = case[1]
+    limit, turn = OPTIONS.good_shift_mm, OPTIONS.good_turn_deg
+    assert check_poses(views, [(0.0, 0.0), (limit, turn)], OPTIONS) == []
+    for correction in ((limit + 0.1, 0.0), (0.0, turn + 0.1)):
+        (finding,) = check_poses(views, [(0.0, 0.0), correction], OPTIONS)
+        assert "view 2 had to be moved" in finding
+
+
+def test_match_rate_and_strict_coverage(case):
+    _, views, tree = case
+    quality = view_quality(tree, views[0], views[0].mask, OPTIONS, views[1])
+    assert quality.match_rate > 0.97 and 0.0 < quality.foreshortening < 0.5
+    assert quality.coverage_2px <= quality.coverage
+    assert view_quality(tree, views[0], views[0].mask, OPTIONS).match_rate is None

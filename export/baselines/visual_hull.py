@@ -14,7 +14,12 @@ from gcar_deploy.types import Image, Volume
 PATH_THRESHOLD_MM = 0.5
 
 
-def visual_hull(path_mm: Sequence[Image], carms: Sequence[CArm], grid: Grid) -> Volume:
+def visual_hull(
+    path_mm: Sequence[Image],
+    carms: Sequence[CArm],
+    grid: Grid,
+    least_path_mm: float = PATH_THRESHOLD_MM,
+) -> Volume:
     """Carve the grid by the silhouettes of all views.
 
     Parameters
@@ -22,6 +27,7 @@ def visual_hull(path_mm: Sequence[Image], carms: Sequence[CArm], grid: Grid) -> 
     path_mm : pictures (rows, columns), mm of vessel along each pixel's ray
     carms : their views
     grid : voxels wanted
+    least_path_mm : a pixel is vessel from this path length on
 
     Returns
     -------
@@ -33,7 +39,7 @@ def visual_hull(path_mm: Sequence[Image], carms: Sequence[CArm], grid: Grid) -> 
         column, row = np.rint(pixels).astype(int).T
         seen = (depth > 0) & (row >= 0) & (row < carm.rows) & (column >= 0)
         seen &= column < carm.columns
-        seen[seen] = picture[row[seen], column[seen]] >= PATH_THRESHOLD_MM
+        seen[seen] = picture[row[seen], column[seen]] >= least_path_mm
         index = index[seen]
     out = np.zeros(grid.shape, np.float32)
     out[tuple(index.T)] = 1

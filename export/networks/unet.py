@@ -3,7 +3,11 @@
 H x W x 1 to (H/alpha) x (W/alpha) x 4: residual blocks with group normalisation and SiLU on each
 level, as in the denoising U-Nets that the paper follows, a 1 x 1 head with four channels, average
 pooling by alpha, then the activations that turn numbers into depth (sigmoid, 0 .. 1) and offset
-(tanh, up to ``OFFSET_PIXELS``).
+(tanh, up to ``OFFSET_PIXELS``). Where in the picture a pixel lies says much about its depth, so
+row and column join the picture as constants, and the coarsest level has a learned map of its own.
+
+The paper's views are always taken from the same directions. For views from anywhere (``pose``) the
+axes of the view enter each block where a denoising U-Net takes its noise level.
 """
 
 from __future__ import annotations
@@ -23,6 +27,8 @@ class UNetConfig:
     pixels: int = 128
     alpha: int = 2
     width: tuple[int, ...] = (8, 16, 32, 64, 96, 128)
+    #: tell the network from where the picture was taken; without, it sees the picture alone
+    pose: bool = False
 
     def __post_init__(self) -> None:
         if self.pixels % self.alpha or self.pixels % 2 ** (len(self.width) - 1):
@@ -32,10 +38,14 @@ class UNetConfig:
             )
 
 
-class _Block(nn.Module):
-    """Two normalised 3 x 3 convolutions beside a straight way."""
+#: width of the embedded pose
+POSE_WIDTH = 48
 
-    def __init__(self, c_in: int, c_out: int) -> None:
+
+class _Block(nn.Module):
+    """Two normalised 3 x 3 convolutions beside a straight way; the pose shifts and scales."""
+
+    def __init__(self, c_in: int, c_out: int, pose: bool) -> None:
         super().__init__()
         self.norm1 = nn.GroupNorm(_groups(c_in), c_in)
         self.conv1 = nn.Conv2d(c_in, c_out, 3, padding=1)
@@ -44,11 +54,15 @@ class _Block(nn.Module):
         self.straight = nn.Conv2d(c_in, c_out, 1) if c_in != c_out else nn.Identity()
         nn.init.zeros_(self.conv2.weight)
         nn.init.zeros_(self.conv2.bias)
+        self.told = nn.Linear(POSE_WIDTH, 2 * c_out) if pose else None
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, c_in, h, w) to (B, c_out, h, w)."""
-        y = self.conv1(nn.functional.silu(self.norm1(x)))
-        y = self.conv2(nn.functional.silu(self.norm2(y)))
+    def forward(self, x: torch.Tensor, pose: torch.Tensor | None) -> torch.Tensor:
+        """(B, c_in, h, w) and (B, POSE_WIDTH) to (B, c_out, h, w)."""
+        y = self.norm2(self.conv1(nn.functional.silu(self.norm1(x))))
+        if self.told is not None:
+            scale, shift = self.told(pose)[:, :, None, None].chunk(2, dim=1)
+            y = y * (1 + scale) + shift
+        y = self.conv2(nn.functional.silu(y))
         return self.straight(x) + y
 
 
@@ -59,28 +73,42 @@ class UNetPredictor(nn.Module):
         super().__init__()
         self.config = config or UNetConfig()
         w = self.config.width
-        self.stem = nn.Conv2d(1, w[0], 3, padding=1)
-        self.down = nn.ModuleList(
-            [_Block(w[max(k - 1, 0)], w[k]) for k in range(len(w))],
+        n = self.config.pixels
+        self.stem = nn.Conv2d(3, w[0], 3, padding=1)
+        p = self.config.pose
+        self.pose = (
+            nn.Sequential(nn.Linear(9, POSE_WIDTH), nn.SiLU(), nn.Linear(POSE_WIDTH, POSE_WIDTH))
+            if p
+            else None
         )
-        self.middle = _Block(w[-1], w[-1])
-        self.up = nn.ModuleList([_Block(w[k + 1] + w[k], w[k]) for k in range(len(w) - 1)])
+        self.down = nn.ModuleList([_Block(w[k - 1], w[k], p) for k in range(1, len(w))])
+        self.place = nn.Parameter(torch.zeros(1, w[-1], *(2 * (n >> (len(w) - 1),))))
+        self.middle = _Block(w[-1], w[-1], p)
+        self.up = nn.ModuleList([_Block(w[k + 1] + w[k], w[k], p) for k in range(len(w) - 1)])
         self.norm = nn.GroupNorm(_groups(w[0]), w[0])
         self.head = nn.Conv2d(w[0], OUTPUTS, 1)
         nn.init.normal_(self.head.weight, std=0.02)
         nn.init.zeros_(self.head.bias)
+        axis = torch.linspace(-1, 1, n)
+        where = torch.stack(torch.meshgrid(axis, axis, indexing="ij"))[None]
+        self.register_buffer("where", where, persistent=False)
 
-    def forward(self, picture: torch.Tensor) -> torch.Tensor:
-        """(B, 1, n, n), 0 .. 1, to (B, 4, n/alpha, n/alpha): depth 0 .. 1, offsets in pixels."""
-        x = self.stem(picture)
-        skips = []
-        for k, block in enumerate(self.down):
-            x = block(nn.functional.avg_pool2d(x, 2) if k else x)
+    def forward(self, picture: torch.Tensor, axes: torch.Tensor | None = None) -> torch.Tensor:
+        """Predict depth 0 .. 1 and offsets in pixels, (B, 4, n/alpha, n/alpha).
+
+        Takes (B, 1, n, n), 0 .. 1, and with ``config.pose`` the (B, 3, 3) axes u, v, d of the view.
+        """
+        told = None if self.pose is None else self.pose(axes.reshape(-1, 9))
+        where = self.where.expand(picture.shape[0], -1, -1, -1)
+        x = self.stem(torch.cat([picture, where], dim=1))
+        skips = [x]
+        for block in self.down:
+            x = block(nn.functional.avg_pool2d(x, 2), told)
             skips.append(x)
-        x = self.middle(x)
+        x = self.middle(x + self.place, told)
         for k in reversed(range(len(self.up))):
             x = nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
-            x = self.up[k](torch.cat([x, skips[k]], dim=1))
+            x = self.up[k](torch.cat([x, skips[k]], dim=1), told)
         x = self.head(nn.functional.silu(self.norm(x)))
         x = nn.functional.avg_pool2d(x, self.config.alpha) if self.config.alpha > 1 else x
         x = x.float()

@@ -24,7 +24,9 @@ COLUMNS = (
 )
 @click.option("--data", type=_FOLDER, help="Label volumes to simulate views of, beside the demo.")
 @click.option("--quick", is_flag=True, help="A coarse grid: about a tenth of the time.")
-@click.option("--repeats", type=click.IntRange(1, 100), default=5, show_default=True)
+@click.option(
+    "--repeats", type=click.IntRange(1, 100), default=5, show_default=True, help="Timings of each."
+)
 @click.option("--threads", type=click.IntRange(1, 256), default=None, help="At most so many.")
 @click.option("--force", is_flag=True, help="Replace bench.csv and bench.svg in the folder.")
 @click.option("--quiet", is_flag=True, help="Neither progress nor warnings.")

@@ -78,7 +78,7 @@ def processor() -> dict[str, Any]:
 def model() -> dict[str, Any]:
     """Name and hash of the shipped model, or why there is none."""
     from gcar_deploy.errors import ModelError
-    from gcar_deploy.predict.center_predictor import CenterPredictor
+    from gcar_deploy.predict.center_predictor import open_predictor
     from gcar_deploy.predict.model_spec import read_model, shipped_model_path
 
     path = shipped_model_path()
@@ -86,7 +86,7 @@ def model() -> dict[str, Any]:
         return {"name": None, "sentence": "no model is installed; the visual hull is thinned"}
     try:
         found = read_model(path)
-        worst = CenterPredictor(found, threads=1).check_golden()
+        worst = open_predictor(found, threads=1).check_golden()
     except ModelError as error:
         return {"name": path.stem, "sentence": str(error)}
     golden = "no golden case" if worst is None else f"golden case within {worst:.0e}"

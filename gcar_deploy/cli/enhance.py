@@ -43,6 +43,13 @@ from gcar_deploy.cli.common import chosen_dicom
     help="For --kind path_length: millimetres of vessel per count.",
 )
 @click.option("--frame", default="auto", show_default=True, help="DICOM: frame, from 1.")
+@click.option(
+    "--segmenter",
+    type=click.Choice(["classic", "net", "both"]),
+    default="classic",
+    show_default=True,
+    help="Who finds the vessels; both writes the network's pictures beside the others.",
+)
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
 def enhance(
     picture: Path,
@@ -52,6 +59,7 @@ def enhance(
     pixel_mm: float | None,
     mm_per_count: float | None,
     frame: str,
+    segmenter: str,
     force: bool,
 ) -> None:
     r"""Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
@@ -63,6 +71,7 @@ def enhance(
     from gcar_deploy.config import DicomOptions, ImagingOptions
     from gcar_deploy.dicom.header import is_dicom
     from gcar_deploy.dicom.scene import read_run
+    from gcar_deploy.engine import load_segmenter
     from gcar_deploy.errors import UsageError
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
@@ -84,8 +93,13 @@ def enhance(
         pixels, valid = read_picture(picture, options.limits), None
     angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
     angiogram = dataclasses.replace(angiogram, valid=valid)
-    found = extract_vessels(angiogram, options)
-    write_folder(out_dir, png_files(found), force=force)
+    pictures: dict[str, bytes] = {}
+    for who in ("classic", "net") if segmenter == "both" else (segmenter,):
+        chosen = dataclasses.replace(options, segmenter=who)
+        found = extract_vessels(angiogram, chosen, load_segmenter(who))
+        prefix = "net_" if (segmenter, who) == ("both", "net") else ""
+        pictures |= {prefix + name: p for name, p in png_files(found).items()}
+    write_folder(out_dir, pictures, force=force)
     length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
     click.echo(
         f"{out_dir}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "

@@ -1,4 +1,4 @@
-"""gcar info RESULT_DIR: what a result folder is, and whether it is still what was written."""
+"""gcar info PATH: what a result folder or a model is, and whether it is still what was written."""
 
 from __future__ import annotations
 
@@ -13,17 +13,25 @@ _MAX_BYTES = 16 * 2**20
 
 
 @click.command("info")
-@click.argument("path", type=click.Path(path_type=Path), metavar="RESULT_DIR")
+@click.argument("path", type=click.Path(path_type=Path), metavar="RESULT_DIR|MODEL")
 @click.option("--json", "as_json", is_flag=True, help="Print the content as one JSON object.")
 def info(path: Path, as_json: bool) -> None:
-    """Print what a result folder holds, and check its files against their hashes.
+    """Print what a result folder holds, or a model's card, and check files against their hashes.
 
     \b
     Example:
       gcar info result
+      gcar info models/gcp-multi.onnx
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
 
+    if path.suffix == ".onnx":
+        from gcar_deploy.cli.model_card import card
+        from gcar_deploy.predict.model_spec import read_model
+
+        model = read_model(path)
+        click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))
+        return
     summary = read_result(path)
     altered = altered_files(path, summary)
     if as_json:

@@ -22,6 +22,7 @@ VERBS = {
     "batch": ("gcar_deploy.cli.batch", "Reconstruct every case of a table."),
     "serve": ("gcar_deploy.cli.serve", "Keep a warm engine for host programs."),
     "bench": ("gcar_deploy.cli.bench", "Measure speed against error."),
+    "listen": ("gcar_deploy.cli.listen", "Reconstruct what arrives by DICOM C-STORE."),
     "doctor": ("gcar_deploy.cli.doctor", "Check this installation."),
     "info": ("gcar_deploy.cli.info", "Print what a result folder or a model is."),
 }

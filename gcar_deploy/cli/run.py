@@ -21,6 +21,7 @@ from gcar_deploy.cli.common import (
     run_options,
     set_up_logging,
 )
+from gcar_deploy.cli.hints import given_masks, hint_options, hinted
 
 
 @click.command("run")
@@ -38,6 +39,7 @@ from gcar_deploy.cli.common import (
 @engine_options
 @backend_options
 @dicom_options
+@hint_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
 @click.option("--glb", is_flag=True, help="Write surface.glb as well.")
@@ -66,6 +68,7 @@ def run(
     verbose: bool,
     quiet: bool,
     as_json: bool,
+    **hints: Any,
 ) -> None:
     """Reconstruct a coronary tree from two or more pictures (PNG, TIFF, NPY, DICOM XA).
 
@@ -92,9 +95,12 @@ def run(
     check_extras(extras)
     options = run_options(predictor, refiner, backend, device)
     options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
+    options = hinted(options, hints)
     engine = Engine(model, threads=threads, options=options)
     with refusals_as_json(as_json), ProgressBar(quiet=quiet) as bar:
-        result = engine.reconstruct(list(views), geom, on_progress=bar, deadline_s=deadline)
+        result = engine.reconstruct(
+            list(views), geom, masks=given_masks(hints), on_progress=bar, deadline_s=deadline
+        )
     for note in () if quiet else result.notes:
         click.echo(f"gcar: {note}", err=True)
     if strict and result.status != "ok":

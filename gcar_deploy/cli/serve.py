@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import secrets
 import signal
@@ -58,6 +59,10 @@ TOKEN_VARIABLE = "GCAR_TOKEN"  # noqa: S105 - the name of a variable
     "--queue", "waiting", type=click.IntRange(1, 1000), default=32, show_default=True,
     help="Jobs that may wait.",
 )  # fmt: skip
+@click.option(
+    "--memory-mib", type=click.IntRange(min=1024), default=8192, show_default=True,
+    help="Address space of the worker, MiB: a job that needs more fails, the worker lives on.",
+)  # fmt: skip
 @predictor_options
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
 def serve(
@@ -68,6 +73,7 @@ def serve(
     limit: float,
     body_mib: int,
     waiting: int,
+    memory_mib: int,
     predictor: str,
     model: str | None,
     refiner: str,
@@ -85,7 +91,13 @@ def serve(
     """  # noqa: D301 - click wants a real backspace
     set_up_logging(verbose, quiet=False)
     limit_threads(threads)
-    token = None if stdio else read_token(token_file)
+    limit_memory(memory_mib)
+    token = None
+    if not stdio:
+        token = read_token(token_file)
+        with needs_extra("serve", "flask", "waitress", "werkzeug"):
+            # Found out before the engine takes its seconds.
+            import gcar_deploy.worker.http  # noqa: F401
     # SIGTERM, like Ctrl-C, ends a server in good order.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from gcar_deploy.engine import Engine
@@ -113,6 +125,9 @@ def _serve_lines(make_queue: Any, allowed: Any) -> None:
     from gcar_deploy.worker.stdio import LineServer
 
     # What a library prints must not stand between the messages.
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        # Bytes that are no text make one message unreadable, not the end of the service.
+        sys.stdin.reconfigure(encoding="utf-8", errors="replace")
     private = os.dup(1)
     os.dup2(2, 1)
     with os.fdopen(private, "w", encoding="utf-8") as sink:
@@ -124,8 +139,8 @@ def _serve_lines(make_queue: Any, allowed: Any) -> None:
 
 def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib: int) -> None:
     try:
-        with needs_extra("serve", "flask", "waitress"):
-            from gcar_deploy.worker.http import LOOPBACK, create_app, listen
+        from gcar_deploy.worker.http import LOOPBACK, create_app, listen
+
         fresh = token is None
         token = token or secrets.token_urlsafe(32)
         server = listen(create_app(queue, token, folder=allowed, body_mib=body_mib), port)
@@ -140,6 +155,18 @@ def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib
             server.close()
     finally:
         queue.close()
+
+
+def limit_memory(mib: int) -> None:
+    """Cap the address space of this process, where the system has such a limit."""
+    try:
+        import resource
+    except ImportError:
+        return
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    wanted = mib * 2**20
+    soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def read_token(file: Path | None) -> str | None:

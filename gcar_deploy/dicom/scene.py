@@ -34,7 +34,7 @@ class Run:
     pixels : (rows, cols) float32 counts; a stored mirror image is turned back
     valid : (rows, cols) bool or None, outside shutters and collimator there is no picture
     intensity : Intensity
-    notes : sentences that begin with the file's name
+    notes : ends of sentences; no file name, for they stand in results
     """
 
     header: Header
@@ -67,7 +67,7 @@ def read_run(path: str | Path, options: DicomOptions, wanted: int | None = None)
     notes += _warnings(header, choice.index)
     return Run(
         header=header, index=choice.index, pixels=pixels, valid=valid, intensity=intensity,
-        notes=tuple(f"{header.name}: {note}" for note in notes),
+        notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -94,7 +94,8 @@ def read_views(
     for number, (path, frame) in enumerate(zip(paths, wanted, strict=True), start=1):
         run = read_run(path, options, frame)
         carm, said = frame_carm(run.header, run.index, options)
-        notes += [*run.notes, *(f"{run.header.name}: {note}" for note in said)]
+        # By number: a result must not carry the name of a file, which may be the patient's.
+        notes += [f"view {number}: {note}" for note in (*run.notes, *said)]
         view = View(id=str(number), carm=carm, intensity=run.intensity)
         views.append(view)
         angiograms.append(as_angiogram(run, view))
@@ -165,5 +166,5 @@ def _warnings(header: Header, frame: int) -> list[str]:
     if header.text("TableMotion") == "DYNAMIC":
         notes.append("the table moved during the run: its position in this frame is not known")
     for note in notes:
-        _log.debug("%s: %s", header.name, note)
+        _log.debug("%s", note)
     return notes

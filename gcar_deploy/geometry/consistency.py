@@ -73,6 +73,32 @@ def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tup
     return out[0], out[1]
 
 
+def match_rate(first: CArm, second: CArm, a: Pixels, b: Pixels, near_mm: float) -> float | None:
+    """Share of the first view's vessel pixels with a possible partner in the second.
+
+    A partner is a vessel pixel whose epipolar plane passes within ``near_mm`` at the isocentre.
+
+    Parameters
+    ----------
+    first, second : CArm
+    a, b : (n, 2) and (m, 2) (col, row) of skeleton pixels
+    near_mm : float
+
+    Returns
+    -------
+    0 .. 1, or None where a view has no pixels
+    """
+    if len(a) == 0 or len(b) == 0:
+        return None
+    reach = 0.5 * float(np.linalg.norm(first.source_mm) + np.linalg.norm(second.source_mm))
+    own = plane_angles(first, second, first, a) * reach
+    other = np.sort(plane_angles(first, second, second, b) * reach)
+    after = np.searchsorted(other, own).clip(0, len(other) - 1)
+    before = (after - 1).clip(0)
+    gap = np.minimum(np.abs(other[after] - own), np.abs(other[before] - own))
+    return float((gap <= near_mm).mean())
+
+
 def disagreement(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> float:
     """Half the summed difference of both profiles: 0 (equal) .. 1 (nothing in common)."""
     a, b = mass_profiles(fixed, moving, carm, sigma_mm)

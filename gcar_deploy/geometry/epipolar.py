@@ -62,6 +62,24 @@ def triangulate(carms: Sequence[CArm], pixels: Sequence[Pixels]) -> tuple[Points
     return points, np.sqrt(np.mean(squares, axis=0))
 
 
+def ray_gaps(first: CArm, second: CArm, a: Pixels, b: Pixels) -> Scalars:
+    """Signed distance between the rays of the same points in two views.
+
+    Parameters
+    ----------
+    first, second : CArm
+    a, b : (n, 2) (col, row) in the first and the second view
+
+    Returns
+    -------
+    (n,) mm, along the common normal of both rays; 0 where they meet
+    """
+    normal = np.cross(first.rays(a), second.rays(b))
+    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    gaps: Scalars = normal @ (second.source_mm - first.source_mm) / length
+    return gaps
+
+
 def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scalars:
     """Angle of the epipolar plane through each (n, 2) pixel of ``carm``, radians.
 

@@ -24,8 +24,8 @@ def quote(value: Any) -> str:
     return text if len(text) <= MAX_QUOTE else text[:MAX_QUOTE] + " ..."
 
 
-def read_json(text: str) -> Any:
-    """Parse JSON strictly: no NaN, Infinity or repeated keys, at most ``MAX_BYTES``.
+def read_json(text: str, max_bytes: int = MAX_BYTES) -> Any:
+    """Parse JSON strictly: no NaN, Infinity or repeated keys, at most ``max_bytes``.
 
     Raises
     ------
@@ -43,8 +43,8 @@ def read_json(text: str) -> Any:
             out[key] = value
         return out
 
-    if len(text.encode("utf-8", "replace")) > MAX_BYTES:
-        raise GeometryError(f"larger than {MAX_BYTES // 1024} KiB")
+    if len(text.encode("utf-8", "replace")) > max_bytes:
+        raise GeometryError(f"larger than {max_bytes // 1024} KiB")
     try:
         return json.loads(text, parse_constant=refuse, object_pairs_hook=pairs)
     except json.JSONDecodeError as error:

@@ -36,6 +36,8 @@ class Angiogram:
         Of the bytes of the file.
     valid : (rows, cols) bool or None
         Where the file itself says that there is a picture (shutters); None for everywhere.
+    mask : (rows, cols) bool or None
+        Vessel as the user says; it wins over anything found in the pixels.
     """
 
     view_id: str
@@ -45,11 +47,13 @@ class Angiogram:
     intensity: Intensity
     sha256: str
     valid: Mask | None = None
+    mask: Mask | None = None
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)
-        if self.valid is not None:
-            _check_shape(self.view_id, self.carm, self.valid)
+        for array in (self.valid, self.mask):
+            if array is not None:
+                _check_shape(self.view_id, self.carm, array)
 
     @classmethod
     def without_geometry(

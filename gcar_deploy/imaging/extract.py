@@ -7,10 +7,11 @@ import logging
 import numpy as np
 
 from gcar_deploy.config import ImagingOptions
-from gcar_deploy.errors import GeometryError, RefusedError
+from gcar_deploy.errors import GeometryError, ModelError, RefusedError
 from gcar_deploy.imaging import calibrate, enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
@@ -18,7 +19,9 @@ _log = logging.getLogger(__name__)
 _POLARITY_MARGIN = 1.15
 
 
-def extract_vessels(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+def extract_vessels(
+    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None = None
+) -> VesselImage:
     """Find mask, skeleton and path length of the vessels.
 
     Parameters
@@ -28,7 +31,8 @@ def extract_vessels(angiogram: Angiogram, options: ImagingOptions) -> VesselImag
         with unknown scale, vessels bright. ``raw``: vessels dark unless the polarity says
         otherwise or the picture clearly does; contrast against the filled-in background,
         scaled by the width of the vessels' shadows.
-    options : ImagingOptions
+    options : ImagingOptions; ``segmenter`` says who finds vessels in grey values
+    segmenter : the network, needed for ``net`` and for the second try of ``auto``
 
     Returns
     -------
@@ -46,7 +50,24 @@ def extract_vessels(angiogram: Angiogram, options: ImagingOptions) -> VesselImag
         raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")
     if angiogram.intensity.kind == "path_length":
         return _from_path_length(angiogram, options)
-    return _from_grey(angiogram, options)
+    if options.segmenter == "net" and angiogram.mask is None:
+        return _from_grey(angiogram, options, _needed(segmenter))
+    try:
+        return _from_grey(angiogram, options, None)
+    except RefusedError:
+        if options.segmenter != "auto" or segmenter is None or angiogram.mask is not None:
+            raise
+        _log.warning(
+            "view %s: the classical method finds no vessel; the network is asked",
+            angiogram.view_id,
+        )
+        return _from_grey(angiogram, options, segmenter)
+
+
+def _needed(segmenter: Segmenter | None) -> Segmenter:
+    if segmenter is None:
+        raise ModelError("segmenter net needs its model, which is not loaded")
+    return segmenter
 
 
 def _nothing(angiogram: Angiogram, reason: str) -> RefusedError:
@@ -72,6 +93,8 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
     smallest = options.path_threshold_pixels * angiogram.carm.pixel_at_isocenter_mm
     valid = np.ones(path.shape, bool) if angiogram.valid is None else angiogram.valid
     mask = (path > smallest) & valid
+    if angiogram.mask is not None:
+        mask &= angiogram.mask
     if not mask.any():
         raise _nothing(angiogram, f"no path is longer than {smallest:.2g} mm")
     if mask.mean() > 0.9:
@@ -88,7 +111,9 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
     )
 
 
-def _from_grey(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+def _from_grey(
+    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
+) -> VesselImage:
     pixels, kind = angiogram.pixels, angiogram.intensity.kind
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     dark = is_dark(angiogram, options)
@@ -96,9 +121,13 @@ def _from_grey(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
     if angiogram.valid is not None:
         holes = holes | ~angiogram.valid
     search = pictures.get("search", next(iter(pictures.values())))
-    found = segment.segment(search, holes, pixel_mm, options)
+    if angiogram.mask is not None:
+        found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm, options)
+    else:
+        found = segment.segment(search, holes, pixel_mm, options, segmenter)
     length = found.skeleton.sum() * pixel_mm
     too_faint = found.contrast < options.min_contrast or found.peak < options.min_peak
+    too_faint &= angiogram.mask is None  # who draws a mask has seen the vessel
     if length < options.min_length_mm or too_faint:
         raise _nothing(
             angiogram,

@@ -10,6 +10,7 @@ import numpy as np
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.net import Segmenter, net_input
 from gcar_deploy.types import Array, Image, Mask
 
 
@@ -38,7 +39,13 @@ class Segmentation:
     contrast: float
 
 
-def segment(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions) -> Segmentation:
+def segment(
+    picture: Image,
+    holes: Mask,
+    pixel_mm: float,
+    options: ImagingOptions,
+    segmenter: Segmenter | None = None,
+) -> Segmentation:
     """Find bright vessels.
 
     The search runs at ``options.work_pixel_mm``, since vessels have a known size in mm; only
@@ -50,6 +57,7 @@ def segment(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOption
     holes : (rows, cols) bool, pixels without picture (collimator)
     pixel_mm : float, pixel size at the isocentre
     options : ImagingOptions
+    segmenter : the network that draws the centreline in place of the ridge filter's hysteresis
     """
     rows, columns = picture.shape
     scale = min(1.0, pixel_mm / options.work_pixel_mm)
@@ -60,7 +68,11 @@ def segment(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOption
     flat = enhance.flatten(work, options.flatten_sigma_mm / work_mm)
     found = enhance.ridges(flat, work_mm, options)
     response = np.where(work_holes, np.float32(0), found.response)
-    line = centreline(response, ~work_holes, work_mm, options)
+    if segmenter is None:
+        line = centreline(response, ~work_holes, work_mm, options)
+    else:
+        sure = segmenter.probability(net_input(flat, response, ~work_holes))
+        line = learned_centreline(sure, ~work_holes, work_mm, options)
     full = (columns, rows)
     vesselness = np.where(holes, np.float32(0), resize(response, full))
     if not line.any():
@@ -98,6 +110,47 @@ def centreline(response: Image, valid: Mask, pixel_mm: float, options: ImagingOp
     if not line.any():
         return line
     return skel.strong_parts(line, response, options.part_share)
+
+
+def learned_centreline(
+    probability: Image, valid: Mask, pixel_mm: float, options: ImagingOptions
+) -> Mask:
+    """(rows, cols) bool: skeleton of what the network calls vessel, without small parts."""
+    sure = np.where(valid, probability, np.float32(0))
+    inside = skel.parts_touching(sure >= options.net_low, sure >= options.net_high)
+    line = skel.skeletonize(inside)
+    if not line.any():
+        return line
+    line = skel.prune(line, sure, options.spur_mm / pixel_mm, 0.0)
+    return skel.strong_parts(line, sure, options.part_share) if line.any() else line
+
+
+def given(
+    picture: Image, mask: Mask, holes: Mask, pixel_mm: float, options: ImagingOptions
+) -> Segmentation:
+    """Take the user's mask as it is; only contrast and noise are measured.
+
+    Parameters
+    ----------
+    picture : (rows, cols) float32, vessels bright
+    mask, holes : (rows, cols) bool
+    pixel_mm : float, pixel size at the isocentre
+    options : ImagingOptions
+    """
+    line = skel.skeletonize(mask)
+    margin, fill = options.margin_mm / pixel_mm, options.fill_sigma_mm / pixel_mm
+    filled = enhance.fill_holes(picture, holes)
+    rise = filled - enhance.background(filled, mask, margin, fill)
+    peak = float(rise[line].mean()) if line.any() else 0.0
+    return Segmentation(
+        mask=mask,
+        skeleton=line,
+        valid=~holes,
+        vesselness=np.where(mask, np.clip(rise, 0, None), np.float32(0)),
+        rim_share=np.zeros(picture.shape, np.float32),
+        peak=peak,
+        contrast=peak / max(_noise_beside(rise, mask), 1e-12) if line.any() else 0.0,
+    )
 
 
 def _without_wires(line: Mask, share: float) -> Mask:

@@ -15,6 +15,7 @@ import numpy as np
 from gcar_deploy.config import RunOptions
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
@@ -93,6 +94,7 @@ class Result:
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],
+            "silent_errors": list(silent_errors([view.carm for view in self.views])),
             "tree": {
                 "length_mm": self.tree.length_mm,
                 "branches": [
@@ -161,6 +163,13 @@ class Result:
             "support": judged.support,
             "distance_mm": judged.distance_mm,
             "overlap": judged.overlap,
+            "coverage_2px": judged.coverage_2px,
+            "match_rate": judged.match_rate,
+            "foreshortening": judged.foreshortening,
+            "disagreement_before": pose.before,
+            "disagreement_after": pose.after,
+            "landmark_gap_before_mm": pose.landmark_before_mm,
+            "landmark_gap_after_mm": pose.landmark_after_mm,
             "estimated_offset_mm": list(pose.offset_mm),
             "estimated_primary_deg": pose.primary_deg,
             "estimated_secondary_deg": pose.secondary_deg,

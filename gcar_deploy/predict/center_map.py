@@ -56,6 +56,10 @@ class NetPicture:
         path = np.clip(self.path_mm / self.pixel_mm, 0.0, MAX_PATH_PIXELS) / MAX_PATH_PIXELS
         return np.ascontiguousarray(path[None, None], dtype=np.float32)
 
+    def axes_input(self) -> Array:
+        """(1, 3, 3) float32, the axes u, v, d of the view, for networks that are told the pose."""
+        return np.ascontiguousarray(self.carm.axes[None], dtype=np.float32)
+
     def cells(self, alpha: int) -> Array:
         """(n/alpha, n/alpha) bool: which cells stand for vessel."""
         inside: Array = blocks(self.path_mm, alpha).max(axis=2) > MIN_PATH_PIXELS * self.pixel_mm
@@ -79,12 +83,14 @@ class ViewCenters:
     ray_mm : (n,) distance from the source along the true ray, mm, offsets not included
     cell : (n, 2) int64, (row, col) of each centre's cell
     alpha : int, pixels of the network's picture per cell edge
+    picture : NetPicture that they were predicted from
     """
 
     points_mm: Points
     ray_mm: Scalars
     cell: Array
     alpha: int
+    picture: NetPicture
 
 
 def net_picture(carm: CArm, path_mm: Image, pixels: int) -> NetPicture:
@@ -135,6 +141,7 @@ def decode(output: Array, picture: NetPicture, alpha: int) -> ViewCenters:
         ray_mm=ray_mm,
         cell=np.argwhere(inside),
         alpha=alpha,
+        picture=picture,
     )
 
 

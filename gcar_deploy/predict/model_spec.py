@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,25 @@ from gcar_deploy.config import ModelLimits
 from gcar_deploy.errors import GeometryError, ModelError
 from gcar_deploy.files import read_bounded
 from gcar_deploy.geometry.fields import read_json
+from gcar_deploy.predict.center_map import DEPTH_PIXELS, MAX_PATH_PIXELS, OFFSET_PIXELS
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES
 from gcar_deploy.predict.golden import Golden, read_golden
 from gcar_deploy.predict.onnx_guard import check_onnx
 
 SCHEMA = "gcar-model/1"
-#: name of the model that ``gcar run`` uses unless told otherwise
-DEFAULT_MODEL = "gcp-multi"
+#: the shipped centre predictor of each kind; ``multi`` is what ``gcar run`` uses unless told
+SHIPPED = {"multi": "gcp-multi", "single": "gcp-single"}
+DEFAULT_MODEL = SHIPPED["multi"]
+#: name of the network that finds vessels in raw pictures
+SEGMENTER_MODEL = "segmenter"
+_WANTED: dict[str, dict[str, float]] = {
+    "multi": {"view_features": VIEW_FEATURES, "levels": LEVELS},
+    "single": {
+        "depth_pixels": DEPTH_PIXELS,
+        "offset_pixels": OFFSET_PIXELS,
+        "max_path_pixels": MAX_PATH_PIXELS,
+    },
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +55,16 @@ class ModelFile:
     golden: Golden | None = dataclasses.field(default=None, repr=False)
     limits: ModelLimits = dataclasses.field(default_factory=ModelLimits, repr=False)
 
+    @property
+    def kind(self) -> str:
+        """``multi`` (all views at once), ``single`` (one view at a time), or another network's."""
+        return str(self.spec.get("kind"))
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """What the model wants, as its spec says."""
+        return dict(self.spec["inputs"])
+
 
 def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
     """Where the wheel keeps the model ``name``, or None if it does not ship it."""
@@ -49,13 +72,16 @@ def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
     return path if path.is_file() else None
 
 
-def read_model(path: Path, limits: ModelLimits | None = None) -> ModelFile:
+def read_model(
+    path: Path, limits: ModelLimits | None = None, wanted: Mapping[str, Any] | None = None
+) -> ModelFile:
     """Read and verify an ONNX file and the spec beside it; nothing of the model is run.
 
     Parameters
     ----------
     path : of the ``.onnx``; its ``.json`` and, where there is one, its ``.golden.npz`` lie beside
     limits : ModelLimits, optional
+    wanted : what its spec must say of ``inputs``; by default those of a centre predictor
 
     Raises
     ------
@@ -73,14 +99,7 @@ def read_model(path: Path, limits: ModelLimits | None = None) -> ModelFile:
             f"model file {path.name} was altered: its SHA-256 starts {digest[:12]}, "
             f"its spec says {str(spec.get('sha256'))[:12]}"
         )
-    wanted = {"view_features": VIEW_FEATURES, "levels": LEVELS}
-    inputs = spec.get("inputs", {})
-    for key, value in wanted.items():
-        if not isinstance(inputs, dict) or inputs.get(key) != value:
-            found = inputs.get(key) if isinstance(inputs, dict) else inputs
-            raise ModelError(
-                f"model {path.name} wants inputs.{key} = {found!r}, this version gives {value}"
-            )
+    _check_inputs(path.name, spec, wanted)
     try:
         check_onnx(data, limits)
     except ValueError as error:
@@ -93,6 +112,38 @@ def read_model(path: Path, limits: ModelLimits | None = None) -> ModelFile:
         golden=read_golden(path, digest, limits),
         limits=limits,
     )
+
+
+def _check_inputs(name: str, spec: dict[str, Any], wanted: Mapping[str, Any] | None) -> None:
+    """Refuse a model that was made for other inputs than this version gives."""
+    kind, inputs = spec.get("kind"), spec.get("inputs")
+    inputs = inputs if isinstance(inputs, dict) else {}
+    if wanted is None:
+        if kind not in SHIPPED:
+            raise ModelError(f"model {name} has kind = {kind!r}; known are {', '.join(SHIPPED)}")
+        if kind == "single":
+            _check_sizes(name, inputs)
+        wanted = _WANTED[str(kind)]
+    for key, value in wanted.items():
+        if inputs.get(key) != value:
+            raise ModelError(
+                f"model {name} wants inputs.{key} = {inputs.get(key)!r}, this version gives {value}"
+            )
+
+
+def _check_sizes(name: str, inputs: dict[str, Any]) -> None:
+    """Refuse sizes of the single-view predictor's picture and cells that make no sense."""
+    for key, low, high in (("pixels", 16, 1024), ("alpha", 1, 64)):
+        value = inputs.get(key)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise ModelError(
+                f"model {name} wants inputs.{key} = {value!r}; a whole number in "
+                f"{low} .. {high} is understood"
+            )
+    if inputs["pixels"] % inputs["alpha"]:
+        raise ModelError(f"model {name}: inputs.pixels is no multiple of inputs.alpha")
+    if not isinstance(inputs.get("pose"), bool):
+        raise ModelError(f"model {name} wants inputs.pose = {inputs.get('pose')!r}, not a bool")
 
 
 def _read(what: str, path: Path, max_bytes: int) -> bytes:

@@ -17,14 +17,23 @@ from gcar_deploy.predict.encoding import Encoded
 from gcar_deploy.types import Array, Scalars
 
 
-def thin_hull(candidates: Candidates, encoded: Encoded, options: CandidateOptions) -> CenterPoints:
+def thin_hull(
+    candidates: Candidates,
+    encoded: Encoded,
+    options: CandidateOptions,
+    start: Scalars | None = None,
+) -> CenterPoints:
     """Share the path of every ray among the hull points behind it.
+
+    Parameters
+    ----------
+    start : (n,) 0 .. 1, what is believed of each point beforehand; None for the even share
 
     Returns
     -------
     CenterPoints with the occupancy as confidence and no radius; ``source = "hull"``.
     """
-    x = np.full(len(candidates), 0.5)
+    x = np.full(len(candidates), 0.5) if start is None else np.clip(start, 1e-6, 1.0)
     for iteration in range(options.thinning_steps):
         x = _explain(x, encoded)
         if iteration < options.thinning_steps - 3:

@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
-from gcar_deploy.geometry.epipolar import plane_normal
-from gcar_deploy.types import Array, Image
+from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
+from gcar_deploy.types import Array, Image, Pixels
 
 #: relative change of the objective or of the pose below which its fit ends
 TOLERANCE = 1e-4
@@ -37,6 +37,8 @@ class Pose:
         Disagreement of the two mass profiles, 0 (equal) .. 1 (nothing in common).
     partner : int
         View that this one was compared with; itself where there was none to compare with.
+    landmark_before_mm, landmark_after_mm : float or None
+        Root mean square distance between the rays of the landmarks that both views show.
     """
 
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -45,13 +47,27 @@ class Pose:
     before: float = 0.0
     after: float = 0.0
     partner: int = 0
+    landmark_before_mm: float | None = None
+    landmark_after_mm: float | None = None
+
+    @property
+    def shift_mm(self) -> float:
+        """Length of the offset."""
+        return float(np.linalg.norm(self.offset_mm))
+
+    @property
+    def turn_deg(self) -> float:
+        """The larger of the two angle corrections."""
+        return max(abs(self.primary_deg), abs(self.secondary_deg))
 
     def applied(self, carm: CArm) -> CArm:
         """Return the view with the correction built in."""
         return _corrected(carm, np.array([*self.offset_mm, self.primary_deg, self.secondary_deg]))
 
 
-def estimate_poses(views: Sequence[tuple[CArm, Image]], options: PoseOptions) -> tuple[Pose, ...]:
+def estimate_poses(
+    views: Sequence[tuple[CArm, Image]], options: PoseOptions, landmarks: Array | None = None
+) -> tuple[Pose, ...]:
     """Estimate the correction of every view against the first, directly or through others.
 
     Each view is compared with that of those already placed whose direction is nearest to 90 deg
@@ -63,11 +79,14 @@ def estimate_poses(views: Sequence[tuple[CArm, Image]], options: PoseOptions) ->
     views : sequence of (CArm, path_mm)
         Path lengths in any scale, zero outside vessels; some 128^2 pixels are enough.
     options : PoseOptions
+    landmarks : (m, V, 2) (col, row) of points marked in the views as they are here, nan where
+        not seen; the rays of one point must meet
 
     Returns
     -------
     tuple of Pose, the first of them zero
     """
+    marks = np.empty((0, len(views), 2)) if landmarks is None else landmarks
     masses = [vessel_mass(carm, path) for carm, path in views]
     poses = {0: Pose()}
     while len(poses) < len(views):
@@ -83,29 +102,35 @@ def estimate_poses(views: Sequence[tuple[CArm, Image]], options: PoseOptions) ->
             poses[k] = Pose(partner=k)
             continue
         fixed = dataclasses.replace(placed, carm=poses[partner].applied(placed.carm))
-        poses[k] = dataclasses.replace(_estimate(fixed, masses[k], options), partner=partner)
+        both = marks[np.isfinite(marks[:, [partner, k]]).all(axis=(1, 2))]
+        found = _estimate(fixed, masses[k], options, (both[:, partner], both[:, k]))
+        poses[k] = dataclasses.replace(found, partner=partner)
     return tuple(poses[k] for k in range(len(views)))
 
 
-def _estimate(fixed: Mass | None, moving: Mass | None, options: PoseOptions) -> Pose:
+def _estimate(
+    fixed: Mass | None, moving: Mass | None, options: PoseOptions, marks: tuple[Pixels, Pixels]
+) -> Pose:
     if fixed is None or moving is None:
         return Pose()
     before = disagreement(fixed, moving, moving.carm, options.fine_mm)
+    gap = _gap_mm(fixed.carm, moving.carm, marks)
+    given = Pose(before=before, after=before, landmark_before_mm=gap, landmark_after_mm=gap)
     if not options.enabled:
-        return Pose(before=before, after=before)
+        return given
     prior = np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
     normal = plane_normal(fixed.carm, moving.carm)
     start, best = np.zeros(5), np.inf
     for shift in np.arange(-options.search_mm, options.search_mm + 1e-9, options.step_mm):
         theta = np.concatenate([shift * normal, np.zeros(2)])
-        r = _residuals(theta, fixed, moving, prior, options.coarse_mm, options)
+        r = _residuals(theta, fixed, moving, prior, options.coarse_mm, options, marks)
         if float(r @ r) < best:
             start, best = theta, float(r @ r)
     for sigma in (options.coarse_mm, options.fine_mm):
         solution = least_squares(
             _residuals,
             start,
-            args=(fixed, moving, prior, sigma, options),
+            args=(fixed, moving, prior, sigma, options, marks),
             diff_step=1e-3,
             x_scale=prior,
             ftol=TOLERANCE,
@@ -113,10 +138,16 @@ def _estimate(fixed: Mass | None, moving: Mass | None, options: PoseOptions) -> 
             max_nfev=options.max_evaluations,
         )
         start = solution.x
-    after = disagreement(fixed, moving, _corrected(moving.carm, start), options.fine_mm)
-    if after > options.min_gain * before:
+    carm = _corrected(moving.carm, start)
+    after, gap_after = (
+        disagreement(fixed, moving, carm, options.fine_mm),
+        _gap_mm(fixed.carm, carm, marks),
+    )
+    marked = gap is not None and gap_after is not None
+    better = marked and (gap_after or 0.0) < options.min_gain * (gap or 0.0)
+    if after > options.min_gain * before and not better:
         # Not clearly better than the geometry as given: leave it alone.
-        return Pose(before=before, after=before)
+        return given
     x, y, z, primary, secondary = (float(value) for value in start)
     return Pose(
         offset_mm=(x, y, z),
@@ -124,15 +155,26 @@ def _estimate(fixed: Mass | None, moving: Mass | None, options: PoseOptions) -> 
         secondary_deg=secondary,
         before=before,
         after=after,
+        landmark_before_mm=gap,
+        landmark_after_mm=gap_after,
     )
 
 
 def _residuals(
-    theta: Array, fixed: Mass, moving: Mass, prior: Array, sigma_mm: float, options: PoseOptions
-) -> Array:
-    a, b = mass_profiles(fixed, moving, _corrected(moving.carm, theta), sigma_mm)
+    theta: Array, fixed: Mass, moving: Mass, prior: Array, sigma_mm: float, options: PoseOptions,
+    marks: tuple[Pixels, Pixels],
+) -> Array:  # fmt: skip
+    carm = _corrected(moving.carm, theta)
+    a, b = mass_profiles(fixed, moving, carm, sigma_mm)
     scale = 1.0 / (options.profile_noise * np.sqrt(float(a @ a)))
-    return np.concatenate([(a - b) * scale, theta / prior])
+    gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
+    return np.concatenate([(a - b) * scale, theta / prior, gaps])
+
+
+def _gap_mm(first: CArm, second: CArm, marks: tuple[Pixels, Pixels]) -> float | None:
+    if len(marks[0]) == 0:
+        return None
+    return float(np.sqrt(np.mean(ray_gaps(first, second, *marks) ** 2)))
 
 
 def _corrected(carm: CArm, theta: Array) -> CArm:

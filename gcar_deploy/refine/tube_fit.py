@@ -72,6 +72,9 @@ def fit_tubes(
     settled_centers, scatter = settled(
         usable_points(centers), [(view.carm, view.path_mm) for view in views]
     )
+    if should_stop is not None:
+        # Whoever cancelled raises here; a deadline is heeded by the first step.
+        should_stop()
     tree = build_tree(settled_centers, tree_options)
     fit = TubeFit(
         tree=tree,

@@ -7,7 +7,6 @@ receives a whole request, within its limits of size and time, before a thread se
 from __future__ import annotations
 
 import hmac
-import json
 import logging
 import shutil
 import threading
@@ -17,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from flask import Flask, Response, jsonify, request, send_from_directory, url_for
+from waitress import create_server
 from werkzeug.datastructures import FileStorage
 from werkzeug.exceptions import HTTPException
 
 from gcar_deploy import __version__
-from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.errors import GcarError, GeometryError, UsageError
+from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.output.result import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
@@ -157,7 +158,8 @@ def _errors(app: Flask) -> None:
 
     @app.errorhandler(Exception)
     def of_bug(error: Exception) -> Response:
-        _log.exception("internal error")
+        _log.error("internal error: %s", type(error).__name__)
+        _log.debug("internal error", exc_info=True)
         return _error(f"internal error: {type(error).__name__}", 1, 500)
 
 
@@ -217,7 +219,7 @@ def _files(job: Job) -> list[str]:
 
 def _order(folder: AllowedFolder | None) -> Order:
     if request.mimetype == "application/json":
-        values = request.get_json()
+        values = _strict(request.get_data(cache=False), "the body")
         if folder is None:
             raise UsageError("this worker takes uploads alone: it was started without --folder")
         return parse_order(values, folder)
@@ -265,10 +267,16 @@ def _json(part: str, default: str) -> Any:
         if len(data) > _MOST_FIELDS:
             raise UsageError(f"part {part}: larger than {_MOST_FIELDS >> 20} MiB")
         text = data.decode("utf-8", "replace")
+    return _strict(text.encode("utf-8", "surrogatepass"), f"part {part}")
+
+
+def _strict(data: bytes, what: str) -> Any:
+    """JSON without NaN or repeated keys."""
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        raise UsageError(f"part {part} is not JSON") from None
+        return read_json(data.decode("utf-8"), _MOST_FIELDS)
+    except (UnicodeDecodeError, GeometryError) as error:
+        reason = error if isinstance(error, GeometryError) else "not UTF-8"
+        raise UsageError(f"{what} is not JSON ({reason})") from None
 
 
 def listen(app: Flask, port: int) -> Any:
@@ -287,8 +295,6 @@ def listen(app: Flask, port: int) -> Any:
     UsageError
         The port is taken.
     """
-    from waitress import create_server
-
     try:
         return create_server(
             app,

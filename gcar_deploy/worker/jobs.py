@@ -189,8 +189,12 @@ class JobQueue:
         except GcarError as error:
             job.error, job.exit_code = str(error), error.exit_code
             state = REFUSED if isinstance(error, RefusedError) else FAILED
+        except MemoryError:
+            job.error, job.exit_code = "out of memory; use a smaller volume or pictures", 1
         except Exception as error:  # noqa: BLE001 - one broken job must not end the worker
-            _log.exception("internal error")
+            # Details may name files: they are told only to whoever asks for them.
+            _log.error("internal error: %s", type(error).__name__)
+            _log.debug("internal error", exc_info=True)
             job.error, job.exit_code = f"internal error: {type(error).__name__}", 1
         job.seconds = time.perf_counter() - started
         # Last, since whoever sees the state may read the rest.

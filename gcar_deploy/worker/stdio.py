@@ -8,12 +8,14 @@ Methods: ``reconstruct`` (params as ``orders.parse_order``; answered when finish
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from collections.abc import Callable
 from typing import IO, Any
 
 from gcar_deploy import __version__
-from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.errors import GcarError, GeometryError, UsageError
+from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.output.result import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue
@@ -62,9 +64,9 @@ class LineServer:
     def _take(self, line: str) -> bool:
         """Answer one line; False ends the service."""
         try:
-            message = json.loads(line)
-        except (ValueError, RecursionError):
-            self._fail(None, PARSE_ERROR, "not JSON")
+            message = read_json(line, 4 * MOST_CHARACTERS)
+        except GeometryError as error:
+            self._fail(None, PARSE_ERROR, f"not JSON ({error})")
             return True
         ident = message.get("id") if isinstance(message, dict) else None
         if not (
@@ -101,6 +103,8 @@ class LineServer:
     def _reconstruct(self, ident: Any, params: Any) -> None:
         order = parse_order(params, self._folder)
         if order.out is None:
+            if order.scratch is not None:
+                shutil.rmtree(order.scratch, ignore_errors=True)
             raise UsageError("out is missing: name the folder for the result")
         # The job may be over before submit returns.
         with self._asking:

@@ -197,6 +197,7 @@ def test_the_table_is_long_enough():
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.req("REQ-02", "REQ-09", "REQ-13", "REQ-31")
 def test_run_refuses(name, good_case, tmp_path):
     spoil, code, words = CASES[name]
     case = tmp_path / "case"
@@ -243,6 +244,7 @@ USAGE = {
 
 
 @pytest.mark.parametrize("name", USAGE)
+@pytest.mark.req("REQ-14", "REQ-15", "REQ-31")
 def test_calls_that_end_early(name, good_case, tmp_path):
     arguments, code = USAGE[name]
     names = {
@@ -258,6 +260,7 @@ def test_calls_that_end_early(name, good_case, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
+@pytest.mark.req("REQ-29")
 def test_an_existing_target_is_refused_before_any_work(kind, good_case, tmp_path):
     out = tmp_path / "out"
     if kind == "folder":

@@ -52,6 +52,7 @@ def test_help_is_quick():
     assert min(times) < 0.15
 
 
+@pytest.mark.req("REQ-35")
 def test_run_prints_the_folder_first_and_nothing_on_stderr(good_case, tmp_path):
     done = gcar(*run_arguments(good_case, tmp_path / "out", "--quiet"))
     assert done.code == 0, done.err
@@ -61,6 +62,7 @@ def test_run_prints_the_folder_first_and_nothing_on_stderr(good_case, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.req("REQ-35")
 def test_json_is_one_object_that_is_the_result(good_case, tmp_path):
     done = gcar(*run_arguments(good_case, tmp_path / "out", "--json"))
     assert done.code == 0, done.err
@@ -84,6 +86,7 @@ def test_json_of_a_refusal_is_one_object_too(good_case, tmp_path):
     jsonschema.validate(found, json.loads(schema))
 
 
+@pytest.mark.req("REQ-27")
 def test_force_replaces_and_info_reads(good_case, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -107,6 +110,7 @@ def test_info_of_something_else(content, tmp_path):
     assert done.code == 2 and done.out == "" and len(done.err.splitlines()) == 1
 
 
+@pytest.mark.req("REQ-05")
 def test_rescaled_pictures_are_taken_and_that_is_said(good_case, tmp_path):
     case = tmp_path / "case"
     shutil.copytree(good_case, case)
@@ -137,6 +141,7 @@ def test_demo_ends_with_a_picture_and_the_time(tmp_path):
     assert (tmp_path / "demo" / "overlay_view1.png").is_file()
 
 
+@pytest.mark.req("REQ-23")
 def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monkeypatch):
     from gcar_deploy import engine
 
@@ -151,6 +156,7 @@ def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.req("REQ-35")
 def test_the_progress_bar_is_for_terminals_only(monkeypatch, capsys):
     from gcar_deploy.cli import common
 

@@ -52,6 +52,7 @@ def test_row_spacing_comes_first(carm):
         ("PositionerSecondaryAngle", "--geom"),
     ],
 )
+@pytest.mark.req("REQ-11")
 def test_what_is_missing_is_named_with_its_option(carm, missing, match):
     with pytest.raises(GeometryError, match=match) as error:
         carm(**{missing: None})

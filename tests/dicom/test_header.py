@@ -82,10 +82,12 @@ def test_monochrome1_is_turned_round(tmp_path):
         ({"BitsStored": 9}, "colour or signed"),
     ],
 )
+@pytest.mark.req("REQ-10")
 def test_out_of_bounds(tmp_path, changes, match):
     refused(tmp_path, as_bytes(classic(**changes)), match)
 
 
+@pytest.mark.req("REQ-10")
 def test_limits_on_bytes_and_on_all_pixels(tmp_path):
     data = as_bytes(classic())
     refused(tmp_path, data, "KiB that are read", DicomLimits(max_bytes=1000))
@@ -109,6 +111,7 @@ def test_damage(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(40))
+@pytest.mark.req("REQ-10")
 def test_random_damage_is_one_line(tmp_path, seed):
     """Bytes turned over at random: read after all, or refused in one line; nothing else."""
     data = bytearray(as_bytes(classic(vessel_frames(2))))

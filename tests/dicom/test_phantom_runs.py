@@ -44,6 +44,7 @@ def test_every_run_loads(folder, name):
 
 
 @pytest.mark.parametrize("name", WITHOUT_SPACING)
+@pytest.mark.req("REQ-11")
 def test_runs_without_spacing_ask_for_it(folder, name):
     pair = [folder / f"{name}.dcm", folder / "IM7.dcm"]
     with pytest.raises(GeometryError, match=f"{name}.dcm: ImagerPixelSpacing.*--pixel-spacing"):

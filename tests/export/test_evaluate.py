@@ -8,9 +8,18 @@ import nibabel
 import numpy as np
 import pytest
 
-from gcar_deploy.errors import RefusedError, UsageError
-from gcar_export import evaluate, evaluation_tables, methods, score
+from gcar_deploy.errors import ModelError, RefusedError, UsageError
+from gcar_export import (
+    evaluate,
+    evaluation_engines,
+    evaluation_jobs,
+    evaluation_tables,
+    methods,
+    paper_tables,
+    score,
+)  # fmt: skip
 from gcar_export.labels import read_label
+from gcar_export.method_settings import DESCRIPTIONS, METHODS, MethodSettings
 from gcar_export.protocols import PROTOCOLS, make_case, write_case
 from tests.conftest import data_dir
 
@@ -51,9 +60,13 @@ class PerfectEngine:
     """Stands in for the runtime: returns what a table asks for."""
 
     answers: dict = {}  # noqa: RUF012
+    model = {"name": "stub"}  # noqa: RUF012
 
     def __init__(self, *, options=None):
         self.options = options
+
+    def warmup(self):
+        return 0.0
 
     def reconstruct(self, angiograms, grid):
         return types.SimpleNamespace(
@@ -120,12 +133,12 @@ def test_protocols_make_the_ready_cases(prefix):
 def test_truth_scores_perfectly_and_a_missing_volume_is_undefined(data):
     case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "paper")
     ok = methods.Solved(volume=case.truth, seconds={}, gaussians=None, status="ok", sentence="")
-    found = evaluate.measure(case, ok)
+    found = evaluation_jobs.measure(case, ok)
     assert set(evaluation_tables.MEASURES) <= set(found)
     assert found["dsc"].value == 1.0
     assert found["new_dsc"].value > 0.8
     none = methods.Solved(volume=None, seconds={}, gaussians=None, status="failed", sentence="")
-    assert all(m.value is None and m.reason for m in evaluate.measure(case, none).values())
+    assert all(m.value is None and m.reason for m in evaluation_jobs.measure(case, none).values())
 
 
 @pytest.fixture
@@ -133,7 +146,6 @@ def engine(monkeypatch, data):
     module = types.ModuleType("gcar_deploy.engine")
     module.Engine = PerfectEngine
     monkeypatch.setitem(__import__("sys").modules, "gcar_deploy.engine", module)
-    monkeypatch.setattr(methods, "run_options", lambda method: method)
     methods._session.cache_clear()
     truth = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "paper").truth
     monkeypatch.setattr(PerfectEngine, "answers", {"volume": lambda views: truth * 0.9})
@@ -159,18 +171,75 @@ def test_evaluation_writes_tables_and_resumes(data, tmp_path, engine, monkeypatc
     assert not list(tmp_path.glob("rows/*.partial"))
     # interrupted: one row is gone, only that one is made again
     (tmp_path / "rows" / "paper-2-4-ours.json").unlink()
-    monkeypatch.setattr(evaluate, "run_job", _counting(evaluate.run_job, calls := []))
+    counted = _counting(evaluation_engines.run_job, calls := [])
+    monkeypatch.setattr(evaluation_engines, "run_job", counted)
     again = evaluate.evaluate(options)
     assert len(calls) == 1
     assert [r["measures"] for r in again] == [r["measures"] for r in rows]
 
 
 def _counting(function, calls):
-    def counted(job):
+    def counted(job, settings):
         calls.append(job)
-        return function(job)
+        return function(job, settings)
 
     return counted
+
+
+def test_changed_settings_are_redone_kept_or_refused_aloud(data, tmp_path, engine, caplog):
+    given = {"data": data, "out": tmp_path, "protocol": "paper", "methods": ("visual_hull",)}
+    first = evaluate.evaluate(evaluate.EvaluateOptions(**given))
+    wider = MethodSettings(hull_path_mm=8.0)
+    changed = {**given, "settings": wider}
+    with pytest.raises(UsageError, match=r"2 rows of visual_hull .* other settings"):
+        evaluate.evaluate(evaluate.EvaluateOptions(**changed, changed="refuse"))
+    kept = evaluate.evaluate(evaluate.EvaluateOptions(**changed, changed="keep"))
+    assert [r["measures"] for r in kept] == [r["measures"] for r in first]
+    assert "kept as they are" in caplog.text
+    calls = []
+    redone = evaluate.evaluate(evaluate.EvaluateOptions(**changed), lambda *a: calls.append(a))
+    assert "made again" in caplog.text
+    assert len(calls) == 2
+    assert {r["settings"] for r in redone} == {wider.digest("visual_hull")}
+    assert redone[0]["measures"] != first[0]["measures"]
+    # nothing changed: nothing is made, unless it is asked for
+    calls.clear()
+    evaluate.evaluate(evaluate.EvaluateOptions(**changed), lambda *a: calls.append(a))
+    assert [text for *_, text in calls] == ["2 rows kept"]
+    again = evaluate.EvaluateOptions(**changed, redo=("visual_hull",))
+    calls.clear()
+    evaluate.evaluate(again, lambda *a: calls.append(a))
+    assert len(calls) == 2
+
+
+def test_rows_depend_on_their_own_settings_alone():
+    plain, other = MethodSettings(), MethodSettings(paper_steps=7)
+    same = {m for m in METHODS if plain.digest(m) == other.digest(m)}
+    assert {"fdk", "sart", "nerp", "visual_hull"} <= same
+    assert not {"hull+paper", "fbp+paper", "multi+paper"} & same
+    assert plain.digest("single+paper") != plain.digest("single+paper-noloss")
+    assert plain.digest("ours") != plain.digest("ours-swapped")
+    assert other.run_options("hull+paper").refine.paper.steps == 7
+    assert plain.run_options("single+paper-noloss").refine.paper.alpha == 1.0
+    assert not plain.run_options("ours-nopose").pose.enabled
+    assert not plain.run_options("ours-round").refine.volume.fuse
+    assert plain.run_options("multi+tube") != plain.run_options("ours-round")
+    assert set(DESCRIPTIONS) == set(METHODS)
+    with pytest.raises(UsageError):
+        MethodSettings(paper_steps=0)
+
+
+def test_a_missing_model_is_said_before_any_work(data, tmp_path, monkeypatch):
+    from gcar_deploy import engine
+
+    monkeypatch.setattr(engine, "shipped_model_path", lambda name: None)
+    methods._session.cache_clear()
+    options = evaluate.EvaluateOptions(
+        data=data, out=tmp_path / "out", protocol="paper", methods=("fdk", "single+paper")
+    )
+    with pytest.raises(ModelError, match=r"^method single\+paper: predictor single has no model"):
+        evaluate.evaluate(options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_refusals_are_rows(data, tmp_path, engine, monkeypatch):
@@ -191,7 +260,7 @@ def test_refusals_are_rows(data, tmp_path, engine, monkeypatch):
 @pytest.mark.parametrize(
     "wrong",
     [{"protocol": "x"}, {"methods": ("x",)}, {"methods": ()}, {"views": (1,)}, {"jobs": 0},
-     {"reference": "hull"}],
+     {"reference": "hull"}, {"engine": "x"}, {"changed": "x"}, {"redo": ("hull",)}],
 )  # fmt: skip
 def test_wrong_options_are_usage_errors(tmp_path, wrong):
     good = {"data": tmp_path, "out": tmp_path, "protocol": "paper", "methods": ("ours",)}
@@ -207,8 +276,10 @@ def test_empty_data_is_a_usage_error(tmp_path):
 def _row(case, method, dsc):
     measures = dict.fromkeys(evaluation_tables.MEASURES) | {"dsc": dsc}
     return {
-        "protocol": "paper", "views": 2, "case": case, "method": method, "measures": measures,
-        "gaussians": None, "seconds": 1.0, "stages": {}, "reasons": {},
+        "protocol": "paper", "dataset": "ImageCAS", "views": 2, "case": case, "method": method,
+        "status": "ok", "sentence": "", "measures": measures, "gaussians": None, "seconds": 1.0,
+        "cpu_seconds": 2.0,
+        "stages": {}, "reasons": {},
     }  # fmt: skip
 
 
@@ -219,6 +290,55 @@ def test_wilcoxon_of_nine_better_cases():
     assert test["p"] == pytest.approx(2 / 2**9)
     assert (test["n"], test["stars"]) == (9, "**")
     assert "40.80 ± 0.55**" in evaluation_tables.markdown(rows, "a")
+
+
+def test_case_rows_survive_the_csv(tmp_path):
+    row = _row("1", "a", 0.5)
+    row |= {"sentence": "so, and so", "gaussians": 7.0, "stages": {"refine": 0.25}}
+    row["measures"]["best_threshold"] = 0.3
+    row["reasons"] = {"ssim": "too small", "ot_1mm": "prediction is empty"}
+    path = tmp_path / "cases.csv"
+    path.write_text(evaluation_tables.case_rows_csv([row]))
+    assert evaluation_tables.read_case_rows(path) == [row]
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(UsageError):
+        evaluation_tables.read_case_rows(path)
+    with pytest.raises(UsageError):
+        evaluation_tables.read_case_rows(tmp_path / "none.csv")
+
+
+def test_the_text_says_where_the_reference_is_not_first():
+    rows = [_row(str(k), "ours", 0.5 + 0.01 * k) for k in range(9)]
+    rows += [_row(str(k), "hull", 0.4 + 0.002 * k) for k in range(9)]
+    assert evaluation_tables.not_first(rows, "ours") == []
+    rows += [_row(str(k), "sart", 0.6) for k in range(9)]
+    rows += [_row(str(k), "fdk", 0.5 + 0.01 * k + (-1) ** k * 0.1 - 0.02) for k in range(9)]
+    (said,) = evaluation_tables.not_first(rows, "ours")
+    assert said.startswith("paper, 2 views, DSC(0.5) %: sart leads by 6.00 (p = 0.004, n=9)")
+    assert "not significantly ahead of fdk (by 0.89, p = " in said
+
+
+def test_paper_layout_keeps_datasets_apart_and_marks_printed_figures():
+    rows = [_row("1", "ours", 0.8), _row("1", "fdk", 0.3), _row("1", "nerp", 0.4)]
+    rows += [{**_row("2", m, 0.5), "dataset": "ASOCA"} for m in ("ours", "fdk")]
+    text = paper_tables.layout(rows, "ours")
+    assert "| ImageCAS (1) | ours | - | - | 80.00 | - |" in text
+    assert "| ASOCA (1) | fdk | - | - | 50.00 | - |" in text
+    printed = [line for line in text.splitlines() if paper_tables.NOTE in line]
+    assert len(printed) == 3  # FBP and NeRP of ImageCAS, FBP of ASOCA: what we have rows of
+    assert "31.36 ± 3.33" in printed[0]
+    assert paper_tables.layout([{**row, "protocol": "raw"} for row in rows], "ours") == ""
+
+
+def test_views_stand_side_by_side():
+    rows = [_row("1", "ours", 0.8), {**_row("1", "ours", 0.9), "views": 4}]
+    assert "| ours | 80.00 | 90.00 |" in evaluation_tables.over_views(rows)
+    assert evaluation_tables.over_views(rows[:1]) == ""
+    assert evaluation_tables.worse_with_views(rows, "ours") == []
+    rows.append({**_row("1", "ours", 0.88), "views": 16})
+    assert evaluation_tables.worse_with_views(rows[::-1], "ours") == [
+        "paper, DSC(0.5) %: ours loses 2.00 from 4 to 16 views"
+    ]
 
 
 def test_undefined_values_are_left_out_and_counted():
@@ -264,6 +384,6 @@ def test_command_line_lists_its_verbs():
     from gcar_export.cli import main
 
     shown = CliRunner().invoke(main, ["--help"]).output
-    for verb in ("evaluate", "score", "simulate", "pair-time"):
+    for verb in ("evaluate", "converge", "score", "simulate", "pair-time"):
         assert verb in shown
         assert "Example:" in CliRunner().invoke(main, [verb, "--help"]).output

@@ -117,8 +117,8 @@ def test_depth_loss_is_the_sum_of_its_three_terms():
     truth = torch.tensor([[0.4, 0.4], [0.4, 1.0]], dtype=torch.float64)
     mask = torch.tensor([[True, True], [True, False]])
     expected = float(silog(predicted[mask].float(), truth[mask].float()))
-    expected += (0.01 + 0.04 + 0.01) / 3  # masked square, a mean
-    expected += 0.0 + 0.1  # one pair of rows with equal errors, one pair of columns 0.1 apart
+    # Masked square, a mean; one pair of rows with equal errors, one pair of columns 0.1 apart.
+    expected += (0.01 + 0.04 + 0.01) / 3 + 0.0 + 0.1
     assert float(depth_loss(predicted, truth, mask)) == pytest.approx(expected, rel=1e-5)
 
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.center_map import decode
+from gcar_export.checkpoint import read_manifest
 from gcar_export.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.render import path_and_depth, path_lengths
 from gcar_export.run_folder import read_log
@@ -147,7 +148,13 @@ def test_training_resumes_to_the_bit(tmp_path):
     for key in a:
         assert torch.equal(a[key], b[key]), key
     names = {f.name for f in (tmp_path / "whole").iterdir()}
-    assert names == {"checkpoint.safetensors", "manifest.json", "log.csv", "curve.png"}
+    assert names == {
+        "checkpoint.safetensors", "best.safetensors", "manifest.json", "log.csv", "curve.png",
+    }  # fmt: skip
+    best = [read_manifest(tmp_path / k / "best.safetensors")["best"] for k in ("whole", "parts")]
+    assert best[0]["step"] == best[1]["step"] in (2, 4)
+    errors = {r["step"]: float(r["depth_error"]) for r in read_log(tmp_path / "whole/log.csv")}
+    assert errors[str(best[0]["step"])] == min(errors.values())
     assert [r["step"] for r in read_log(tmp_path / "whole/log.csv")] == ["2", "4"]
 
 

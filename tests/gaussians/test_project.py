@@ -93,6 +93,7 @@ def test_line_integral_keeps_its_digits_in_single_precision():
 
 
 @pytest.mark.parametrize(("sigma", "bound"), [((2.0, 2.2), 4e-3), ((1.5, 4.0), 2e-2)])
+@pytest.mark.req("REQ-44")
 def test_footprint_against_exact_rays_averaged_over_the_pixel(sigma, bound):
     view, g = carm(), random_gaussians(5, 3, sigma=sigma)
     image = project(g, view, cut_sigmas=6)
@@ -108,6 +109,7 @@ def test_footprint_against_exact_rays_averaged_over_the_pixel(sigma, bound):
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.5, 1.0])
 @pytest.mark.parametrize(("size", "pitch"), [(128, 1.4), (512, 0.35)])
+@pytest.mark.req("REQ-44")
 def test_mass_is_conserved_however_thin(sigma, size, pitch):
     view, g = carm(size, pitch), random_gaussians(20, 4, sigma=(sigma, sigma * 1.01))
     depth = view.project(g.means_mm)[1]
@@ -125,6 +127,7 @@ def test_mass_is_conserved_however_thin(sigma, size, pitch):
         assert mass == pytest.approx(one.masses_mm3()[0], rel=bound)
 
 
+@pytest.mark.req("REQ-43")
 def test_gradient_against_central_differences():
     view, g = carm(64, 2.8), random_gaussians(8, 5)
     weight = np.random.default_rng(5).normal(size=(64, 64))

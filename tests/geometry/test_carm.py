@@ -22,6 +22,7 @@ def made(view):
 
 
 @pytest.mark.parametrize("case", GOLDEN, ids=range(len(GOLDEN)))
+@pytest.mark.req("REQ-01")
 def test_golden_projections(case):
     points = np.array(case["points_lps_mm"])
     pixels, depth = made(case["view"]).project(points)
@@ -40,6 +41,7 @@ def test_matrix_alone_is_the_same_view(case):
     np.testing.assert_allclose(other.source_mm, carm.source_mm, atol=1e-5)
 
 
+@pytest.mark.req("REQ-01")
 def test_contract_example():
     carm = CArm(
         primary_angle_deg=30,
@@ -157,6 +159,7 @@ def wrong_order(carm):
     return K @ np.column_stack([R, [0, 0, carm.sod_mm]])
 
 
+@pytest.mark.req("REQ-01")
 def test_chirality_at_oblique_angles():
     """Wrong order, wrong signs and mirrors all move points by many pixels at oblique angles."""
     carm = CArm(primary_angle_deg=30, secondary_angle_deg=25, **BASE)

@@ -5,7 +5,13 @@ import pytest
 
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.consistency import HALF_BINS, disagreement, mass_profiles, vessel_mass
+from gcar_deploy.geometry.consistency import (
+    HALF_BINS,
+    disagreement,
+    mass_profiles,
+    match_rate,
+    vessel_mass,
+)
 from gcar_deploy.geometry.epipolar import plane_angles, plane_normal
 
 SIZE = 256
@@ -91,3 +97,15 @@ def test_views_without_epipolar_planes_are_refused(b):
     first, second = view(0, 0), view(*b)
     with pytest.raises(GeometryError, match=r"epipolar planes|face each other"):
         plane_angles(first, second, first, np.zeros((1, 2)))
+
+
+def test_match_rate_is_one_for_one_set_of_points_and_the_share_for_half_of_it():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-40, 40, (400, 3))
+    a, b = (v.project(points)[0] for v in PAIR)
+    assert match_rate(*PAIR, a, b, 0.05) == 1.0
+    normal = plane_normal(*PAIR)
+    upper = points @ normal > 0
+    # Half of the planes hold no partner any more.
+    assert match_rate(*PAIR, a, b[upper], 0.05) == pytest.approx(upper.mean(), abs=0.03)
+    assert match_rate(*PAIR, a, b[:0], 0.05) is None

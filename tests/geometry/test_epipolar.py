@@ -9,6 +9,7 @@ from gcar_deploy.geometry.epipolar import (
     fundamental_matrix,
     plane_angles,
     plane_normal,
+    ray_gaps,
     triangulate,
 )
 
@@ -64,3 +65,17 @@ def test_isocentre_lies_in_plane_zero_and_the_normal_is_across_it():
         assert abs(normal @ carm.axes[2]) < 1e-12
         at = plane_angles(*pair, carm, carm.project(np.array([[0.0, 0, 0], 5 * normal]))[0])
         assert abs(at[0]) < 1e-12 and abs(at[1]) > 1e-3
+
+
+def test_rays_of_one_point_meet_and_a_move_along_the_normal_parts_them():
+    first, second = view(-30, -20), view(45, 25)
+    points = np.array([[0.0, 0, 0], [20, -10, 30], [-30, 25, -5]])
+    a, b = (v.project(points)[0] for v in (first, second))
+    np.testing.assert_allclose(ray_gaps(first, second, a, b), 0, atol=1e-9)
+    normal = plane_normal(first, second)
+    moved = second.moved(2.0 * normal).project(points)[0]
+    # The rays at the isocentre part by the move itself; elsewhere by its share of the normal.
+    assert abs(ray_gaps(first, second, a, moved)[0]) == pytest.approx(2.0, abs=0.02)
+    within = np.cross(normal, second.axes[2])
+    silent = second.moved(2.0 * within).project(points)[0]
+    assert abs(ray_gaps(first, second, a, silent)[0]) < 1e-6

@@ -116,6 +116,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("data", "message"), BAD, ids=range(len(BAD)))
+@pytest.mark.req("REQ-02")
 def test_bad_scene_is_one_line_that_says_where(data, message):
     with pytest.raises(GeometryError) as caught:
         parse_scene(json.dumps(data), "g.json")
@@ -138,6 +139,7 @@ def test_bad_scene_is_one_line_that_says_where(data, message):
         (json.dumps(SCENE).replace("765", "1e999", 1), "not a finite number"),
     ],
 )
+@pytest.mark.req("REQ-03")
 def test_bad_json(text, message):
     with pytest.raises(GeometryError, match=message):
         parse_scene(text)
@@ -173,6 +175,7 @@ def test_unusual_values_are_warned_about():
     assert scene.warnings == ("view 1: sod_mm = 500 mm is outside the usual 600 .. 900 mm",)
 
 
+@pytest.mark.req("REQ-06")
 def test_matrix_alone_is_enough():
     carm = parse_scene(json.dumps(SCENE)).views[0].carm
     data = changed(
@@ -198,6 +201,7 @@ def matrix_view(**more):
         {"isocenter_offset_mm": [0, 0, 5]},
     ],
 )
+@pytest.mark.req("REQ-06")
 def test_nothing_beside_a_lone_matrix_is_ignored(more):
     with pytest.raises(GeometryError, match="at odds with a lone projection_matrix"):
         parse_scene(json.dumps(matrix_view(**more)[1]))
@@ -217,6 +221,7 @@ def test_pixel_spacing_beside_a_lone_matrix_tells_the_detector():
             parse_scene(json.dumps(matrix_view(pixel_spacing_mm=bad)[1]))
 
 
+@pytest.mark.req("REQ-05")
 def test_picture_of_another_size():
     carm = CArm(
         **{k: v for k, v in VIEW.items() if k not in ("intensity", "pixel_spacing_mm")},
@@ -263,6 +268,7 @@ def agree(validator, data):
         validator.validate(data)
 
 
+@pytest.mark.req("REQ-04")
 def test_schema_file_says_the_same():
     validator = schema_validator()
     validator.validate(SCENE)
@@ -307,6 +313,7 @@ VALUES = st.one_of(
 
 @settings(max_examples=300, deadline=None)
 @given(st.sampled_from(PATHS), st.one_of(VALUES, st.just(KeyError)))
+@pytest.mark.req("REQ-04")
 def test_schema_and_parser_agree_on_any_change(path, value):
     data = copy.deepcopy(SCENE)
     data["views"][0]["intensity"]["mm_per_count"] = None
@@ -324,6 +331,7 @@ def test_schema_and_parser_agree_on_any_change(path, value):
 
 @settings(max_examples=60, deadline=None)
 @given(st.text(max_size=60))
+@pytest.mark.req("REQ-03")
 def test_any_text_is_refused_in_one_line(text):
     with pytest.raises(GeometryError) as caught:
         parse_scene(text)

@@ -17,6 +17,7 @@ def _dice(a, b):
     return 2 * (a & b).sum() / (a.sum() + b.sum())
 
 
+@pytest.mark.req("REQ-12")
 def test_path_length_is_exact():
     truth = tube_paths()
     counts = np.round(truth / 0.001)
@@ -40,6 +41,7 @@ def test_thin_vessel_survives_in_coarse_path_lengths():
 
 
 @pytest.mark.parametrize("radius_mm", [0.9, 1.5, 2.2])
+@pytest.mark.req("REQ-12")
 def test_raw_tube_gives_mask_and_path_within_a_stated_tolerance(radius_mm):
     truth = tube_paths(radius_mm=radius_mm)
     found = extract_vessels(angiogram(raw_picture(truth)), _OPTIONS)
@@ -72,6 +74,7 @@ def test_sixteen_bit_equals_eight_bit_within_quantisation():
     assert b.path_mm.sum() == pytest.approx(a.path_mm.sum(), rel=0.03)
 
 
+@pytest.mark.req("REQ-12")
 def test_attenuation_scale_does_not_matter():
     truth = tube_paths()
     noise = np.random.default_rng(4).normal(0, 0.05, truth.shape)

@@ -25,6 +25,7 @@ _shapes = hnp.array_shapes(min_dims=2, max_dims=2, min_side=16, max_side=40)
 
 @_quick
 @given(data=st.data(), suffix=st.sampled_from([".png", ".tif", ".npy"]))
+@pytest.mark.req("REQ-07")
 def test_round_trip_keeps_every_count(tmp_path, data, suffix):
     dtype = data.draw(st.sampled_from([np.uint8, np.uint16]))
     picture = data.draw(hnp.arrays(dtype, _shapes))
@@ -60,6 +61,7 @@ def test_grey_stored_as_colour_is_grey(tmp_path):
         np.testing.assert_array_equal(read_picture(tmp_path / "p.png")[0], grey)
 
 
+@pytest.mark.req("REQ-07")
 def test_exif_rotation_is_not_obeyed(tmp_path):
     tags = struct.pack(">HHHIHH", 1, 0x0112, 3, 1, 6, 0) + bytes(4)
     exif = png_chunk(b"eXIf", b"MM\x00*\x00\x00\x00\x08" + tags)
@@ -157,6 +159,7 @@ _BAD = {
 
 
 @pytest.mark.parametrize("name", sorted(_BAD))
+@pytest.mark.req("REQ-08")
 def test_bad_files_have_one_clear_line(tmp_path, name):
     data, words = _BAD[name]
     path = tmp_path / name
@@ -169,6 +172,7 @@ def test_bad_files_have_one_clear_line(tmp_path, name):
     assert path.read_bytes() == data and len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.req("REQ-09")
 def test_missing_folder_pipe_and_size(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "folder.png").mkdir()
@@ -188,6 +192,7 @@ def test_missing_folder_pipe_and_size(tmp_path):
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.data())
+@pytest.mark.req("REQ-08")
 def test_flipped_bytes_give_a_picture_or_an_image_error(tmp_path, data):
     suffix, original = data.draw(
         st.sampled_from([(".png", png()), (".tif", _tiff()), (".npy", _npy(_GREY))])

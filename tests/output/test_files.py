@@ -17,6 +17,7 @@ from gcar_deploy.output.tables import centerline_vtp, gaussians_ply
 from gcar_deploy.output.volume import nifti_bytes
 
 
+@pytest.mark.req("REQ-25")
 def test_the_folder_holds_what_the_contract_says(folder):
     assert {p.name for p in folder.iterdir()} == {
         "result.json", "volume.nii.gz", "gaussians.npz", "gaussians.ply", "centerline.vtp",
@@ -24,6 +25,7 @@ def test_the_folder_holds_what_the_contract_says(folder):
     }  # fmt: skip
 
 
+@pytest.mark.req("REQ-27")
 def test_manifest_lists_every_other_file_with_its_hash(folder):
     listed = json.loads((folder / "result.json").read_text())["files"]
     others = {p.name for p in folder.iterdir()} - {"result.json"}
@@ -34,6 +36,7 @@ def test_manifest_lists_every_other_file_with_its_hash(folder):
         assert hashlib.sha256(data).hexdigest() == entry["sha256"]
 
 
+@pytest.mark.req("REQ-26")
 def test_result_json_is_strict_and_follows_its_schema(folder):
     jsonschema = pytest.importorskip("jsonschema")
 
@@ -48,6 +51,7 @@ def test_result_json_is_strict_and_follows_its_schema(folder):
     assert summary["reasons"]["/model"]
 
 
+@pytest.mark.req("REQ-26")
 def test_every_null_has_a_reason(result):
     summary = result.summary()
     reasons = summary["reasons"]
@@ -78,6 +82,7 @@ def test_the_same_result_gives_the_same_bytes(result, files):
     assert files == again
 
 
+@pytest.mark.req("REQ-32")
 def test_volume_by_nibabel(result, folder):
     nibabel = pytest.importorskip("nibabel")
     image = nibabel.load(folder / "volume.nii.gz")
@@ -122,6 +127,7 @@ def test_ply_by_plyfile(result):
     assert np.all((red > 0) & (red < 1))
 
 
+@pytest.mark.req("REQ-32")
 def test_centreline_by_vtk(result, folder):
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
@@ -169,6 +175,7 @@ def test_csv_rows_are_the_points(result, folder):
     )
 
 
+@pytest.mark.req("REQ-32")
 def test_surface_by_vtk(result, folder):
     vtk = pytest.importorskip("vtk")
     reader = vtk.vtkSTLReader()

@@ -32,6 +32,7 @@ def test_makes_missing_parents(tmp_path):
     assert listing(tmp_path / "x" / "y" / "out") == FILES
 
 
+@pytest.mark.req("REQ-29")
 def test_an_existing_folder_is_refused_and_untouched(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -52,6 +53,7 @@ def test_force_replaces_the_folder_whole(tmp_path, monkeypatch, exchange):
 
 
 @pytest.mark.parametrize("kind", ["link to folder", "dangling link", "file"])
+@pytest.mark.req("REQ-29")
 def test_links_and_files_are_refused(tmp_path, kind):
     out = tmp_path / "out"
     if kind == "file":
@@ -90,6 +92,7 @@ def test_a_file_in_the_way_of_the_parents(tmp_path):
 @pytest.mark.parametrize("step", ["_write", "_sync_folder", "_put"])
 @pytest.mark.parametrize("error", [OSError(28, "No space left"), KeyboardInterrupt()])
 @pytest.mark.parametrize("existing", [False, True])
+@pytest.mark.req("REQ-28")
 def test_any_fault_leaves_what_was_there(tmp_path, monkeypatch, step, error, existing):
     parent = tmp_path / "new"
     if existing:
@@ -142,6 +145,7 @@ def test_a_folder_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.req("REQ-24")
 def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
     out = tmp_path / "out"
     script = (

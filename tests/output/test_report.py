@@ -55,6 +55,7 @@ def test_status_comes_first(text, result):
     assert visible[0] == result.status
 
 
+@pytest.mark.req("REQ-38")
 def test_nothing_is_fetched(page, text):
     for tag, attributes in page.tags:
         for name in ("src", "href", "action", "srcset", "data"):
@@ -63,6 +64,7 @@ def test_nothing_is_fetched(page, text):
     assert "http:" not in text and "https:" not in text and "@import" not in text
 
 
+@pytest.mark.req("REQ-38")
 def test_policy_allows_exactly_the_own_script_and_style(page):
     policy = next(
         a["content"] for tag, a in page.tags

@@ -35,6 +35,7 @@ def owner(parent: Path) -> tuple[subprocess.Popen[str], Path]:
     return process, Path(process.stdout.readline().strip())
 
 
+@pytest.mark.req("REQ-30")
 def test_a_living_owners_folder_stays_and_a_killed_ones_goes(tmp_path):
     process, folder = owner(tmp_path)
     with process:
@@ -54,6 +55,7 @@ def test_own_folder_is_not_swept_from_within(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.req("REQ-30")
 def test_what_is_not_ours_stays(tmp_path):
     for name in (".gcar-save-", ".gcar-save-short", ".gcar-cache", "gcar-save-abcdefgh"):
         (tmp_path / name).mkdir(mode=0o700)
@@ -65,6 +67,7 @@ def test_what_is_not_ours_stays(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == before
 
 
+@pytest.mark.req("REQ-30")
 def test_the_only_copy_of_a_result_is_never_swept(tmp_path):
     """Killed between two renames, the old result lies in the scratch folder alone."""
     scratch = tmp_path / ".gcar-save-abcdefgh"

@@ -55,6 +55,7 @@ def test_coarse_to_fine_equals_brute_force():
     np.testing.assert_array_equal(hull.index, every[keep])
 
 
+@pytest.mark.req("REQ-34")
 def test_order_of_views_is_nothing():
     a = visual_hull(scene(), GRID, CandidateOptions())
     b = visual_hull(scene()[::-1], GRID, CandidateOptions())

@@ -37,6 +37,7 @@ def test_one_answer_per_candidate():
     assert centers.offset_mm.shape == (len(hull), 3)
 
 
+@pytest.mark.req("REQ-34")
 def test_any_number_of_views_in_any_order():
     predictor = CenterPredictor(read_model(TINY))
     angles = ((-30, -20), (45, 25), (0, 30), (80, 0))
@@ -47,6 +48,7 @@ def test_any_number_of_views_in_any_order():
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
+@pytest.mark.req("REQ-33")
 def test_same_input_same_bytes(threads):
     """Sums by scatter would race between threads and fail this."""
     hull, encoded = inputs()
@@ -63,6 +65,7 @@ def copy(tmp_path):
     return tmp_path / "m.onnx"
 
 
+@pytest.mark.req("REQ-16")
 def test_altered_model_is_refused(copy):
     data = bytearray(copy.read_bytes())
     data[len(data) // 2] ^= 1
@@ -86,6 +89,7 @@ def test_altered_model_is_refused(copy):
         (lambda p: edit(p, "inputs", None), "wants inputs"),
     ],
 )
+@pytest.mark.req("REQ-16")
 def test_wrong_files_say_what_is_wrong(copy, change, message):
     change(copy)
     with pytest.raises(ModelError, match=message):
@@ -114,6 +118,7 @@ class _Broken:
         return [np.full((feed["ray"].shape[1], 5), np.nan, np.float32)]
 
 
+@pytest.mark.req("REQ-20")
 def test_values_that_are_not_finite_are_an_error():
     untested = dataclasses.replace(read_model(TINY), golden=None)
     with pytest.raises(NumericalError, match="not finite"):

@@ -160,6 +160,7 @@ ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], None], str]] = {
 }
 
 
+@pytest.mark.req("REQ-17")
 def test_good_models_pass():
     check_onnx(model().SerializeToString(), ModelLimits())
     typed = model()
@@ -172,6 +173,7 @@ def test_good_models_pass():
 
 
 @pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.req("REQ-17")
 def test_attack_is_refused(name):
     change, words = ATTACKS[name]
     attacked = model()
@@ -193,6 +195,7 @@ def test_limits_can_be_changed(field):
         check_onnx(model().SerializeToString(), tight)
 
 
+@pytest.mark.req("REQ-17")
 def test_the_walk_agrees_with_the_reference_parser():
     """What the guard lets through after random damage, the reference parser reads as it does."""
     chance = random.Random(0)  # noqa: S311 - reproducible damage, no secret

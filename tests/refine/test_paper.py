@@ -51,6 +51,7 @@ def points(g, noise, seed=0):
     )
 
 
+@pytest.mark.req("REQ-43")
 def test_loss_and_its_gradient():
     rng = np.random.default_rng(0)
     made, picture = rng.random((9, 11)), rng.random((9, 11)).astype(np.float32)
@@ -120,6 +121,7 @@ def test_thinned_start_keeps_mass_centre_and_distance():
     assert len(initial_gaussians(nothing, PaperOptions(thin_cells=1.1))) == 0
 
 
+@pytest.mark.req("REQ-22")
 def test_numbers_that_are_not_finite_end_the_run_after_five_rejected_steps():
     truth = random_gaussians(10, 6, sigma=(1.5, 2.5))
     views = views_of(truth)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from gcar_deploy.config import PoseOptions
+from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.epipolar import plane_normal
+from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose, estimate_poses
 
 render = pytest.importorskip("gcar_export.render", reason="needs the export extra")
@@ -50,6 +52,48 @@ def test_shift_with_an_angle_error_as_in_a_room():
     moved = np.array([1.5, -2.0, 3.0])
     pose = estimate_poses(pictures(moved=moved, turned=1.0), PoseOptions())[1]
     assert np.dot(pose.offset_mm, normal) == pytest.approx(moved @ normal, abs=0.6)
+
+
+def landmarks(moved, count):
+    """Pixels of points of the tree in both pictures, as a person would mark them."""
+    starts = random_tree(np.random.default_rng(4)).sides("left").segments()[0]
+    points = starts[:: len(starts) // count][:count]
+    views = TOLD[0], TOLD[1].moved(moved)
+    return np.stack([view.project(points)[0] for view in views], axis=1)
+
+
+def test_a_landmark_decides_where_the_profiles_cannot():
+    """The second picture shows another vessel tree, so its mass misleads; the marks do not."""
+    normal = plane_normal(*TOLD)
+    moved = 6.0 * normal
+    (a, b) = pictures(moved=moved)
+    path = pictures(seed=5)[1][1]
+    marks = landmarks(moved, 3)
+    without = estimate_poses([a, (b[0], path)], PoseOptions())[1]
+    pose = estimate_poses([a, (b[0], path)], PoseOptions(), marks)[1]
+    assert abs(np.dot(without.offset_mm, normal) - 6.0) > 1.0
+    # What is missing of the move is in the angles: the marks lie close together.
+    assert np.dot(pose.offset_mm, normal) == pytest.approx(6.0, abs=1.0)
+    assert pose.landmark_before_mm > 3.0 and pose.landmark_after_mm < 0.9
+
+
+def test_a_landmark_seen_once_says_nothing():
+    marks = landmarks(np.zeros(3), 1)
+    marks[0, 0] = np.nan
+    pose = estimate_poses(pictures(), PoseOptions(), marks)[1]
+    assert pose.landmark_before_mm is None and pose.offset_mm == (0, 0, 0)
+
+
+def test_landmarks_are_checked():
+    mark = ((10.0, 20.0), (30.0, 40.0))
+    assert landmark_pixels([mark], TOLD).shape == (1, 2, 2)
+    for wrong, words in (
+        (((10.0, 20.0),), "1 points for 2 views"),
+        (((10.0, 20.0), None), "one view"),
+        (((-1.0, 20.0), (30.0, 40.0)), "outside"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            landmark_pixels([wrong], TOLD)
 
 
 def test_blank_picture_and_switched_off():

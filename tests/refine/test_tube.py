@@ -25,6 +25,7 @@ def prior_of(tubes):
     return make_prior(tubes, np.ones(len(tubes.log_radius)), OPTIONS)
 
 
+@pytest.mark.req("REQ-43")
 def test_gradient_matches_differences():
     truth = fork()
     targets = make_targets(seen(truth, two_views(128, 1.0)), 1.0, OPTIONS)
@@ -226,6 +227,7 @@ def test_blank_pictures_leave_nothing_standing_and_nothing_breaks():
 
 
 @pytest.mark.parametrize("seed", range(10))
+@pytest.mark.req("REQ-22")
 def test_poisoned_starts_stay_finite_and_bounded(seed):
     rng = np.random.default_rng(seed)
     n = 400

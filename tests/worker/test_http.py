@@ -85,6 +85,7 @@ def test_a_full_queue_says_when_to_come_back(serving, gate):
     assert full.status == 503 and full.headers["Retry-After"] == "2"
 
 
+@pytest.mark.req("REQ-40")
 def test_health_and_document_need_no_token_all_else_does(serving):
     ask, _ = serving
     for token in (None, "wrong", TOKEN + "x", ""):
@@ -100,17 +101,20 @@ def test_health_and_document_need_no_token_all_else_does(serving):
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "192.0.2.1", ""])
+@pytest.mark.req("REQ-40")
 def test_other_host_names_are_not_served(serving, host):
     ask, _ = serving
     reply = ask("GET", "/health", Host=host)
     assert reply.status in (400, 421)
 
 
+@pytest.mark.req("REQ-40")
 def test_web_pages_are_not_served(serving):
     ask, _ = serving
     assert ask("GET", "/health", Origin="http://127.0.0.1").status == 403
 
 
+@pytest.mark.req("REQ-40")
 def test_only_the_loopback_interface_listens(serving):
     ask, _ = serving
     table = Path("/proc/net/tcp")
@@ -143,6 +147,7 @@ def test_only_the_loopback_interface_listens(serving):
         ({"forse": True}, "did you mean 'force'"),
     ],
 )
+@pytest.mark.req("REQ-41")
 def test_orders_that_are_refused(serving, tmp_path, change, words):
     ask, folder = serving
     secret = tmp_path / "outside"
@@ -197,6 +202,7 @@ def test_bad_bodies(serving):
     assert ask("PUT", "/v1/reconstruct").status == 405
 
 
+@pytest.mark.req("REQ-41")
 def test_a_declared_flood_is_cut_before_it_is_read(serving):
     ask, _ = serving
     link = http.client.HTTPConnection("127.0.0.1", ask.port, timeout=60)

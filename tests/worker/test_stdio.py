@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -113,6 +114,7 @@ def test_messages_that_are_not_understood(make_queue, line, code):
     host.end()
 
 
+@pytest.mark.req("REQ-41")
 def test_paths_are_held_to_the_folder_where_one_is_given(make_queue, case_folder, tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -142,3 +144,46 @@ def test_as_a_process_of_its_own(case_folder, tmp_path):
     assert message["result"]["out"] == str(tmp_path / "out")
     out, err = worker.communicate(timeout=120)
     assert out == "" and err == "" and worker.returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="POSIX limits")
+@pytest.mark.req("REQ-41")
+def test_a_job_that_needs_too_much_memory_fails_alone(good_case, tmp_path):
+    """2^28 voxels are allowed and want several GiB; the worker may have two."""
+    geometry = json.loads((good_case / "geom.json").read_text())
+    huge = json.loads(json.dumps(geometry))
+    huge["volume"]["shape"] = [640, 640, 640]
+    views = [str(good_case / f"view{k}.png") for k in (1, 2)]
+    lines = [b"\xff\xfe no text", b'{"jsonrpc": "2.0", "jsonrpc": "2.0"}']
+    for number, scene in enumerate((huge, geometry)):
+        order = {"views": views, "geometry": scene, "out": str(tmp_path / f"out{number}")}
+        message = {"jsonrpc": "2.0", "id": number, "method": "reconstruct", "params": order}
+        lines.append(json.dumps(message).encode())
+    command = [sys.executable, "-m", "gcar_deploy.cli.main", "serve", "--stdio", "--predictor",
+               "none", "--threads", "1", "--memory-mib", "2048"]  # fmt: skip
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    ) as worker:  # fmt: skip
+        assert worker.stdin and worker.stdout
+        worker.stdin.write(b"\n".join(lines) + b"\n")
+        worker.stdin.flush()
+        answers: dict[object, dict] = {}
+        refused = 0
+        for line in worker.stdout:
+            message = json.loads(line)
+            if message.get("method") == "progress":
+                continue
+            if message["id"] is None:
+                refused += 1
+            else:
+                answers[message["id"]] = message
+            if len(answers) == 2:
+                break
+        worker.stdin.close()
+        assert worker.wait(timeout=120) == 0
+    assert refused == 2
+    assert "out of memory" in answers[0]["error"]["message"] and answers[0]["error"]["code"] == 1
+    assert answers[1]["result"]["result"]["status"] in ("ok", "degraded")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out1"]

@@ -1,0 +1,86 @@
+"""Read a checkpoint that may come from anywhere: tensors only, nothing is ever run.
+
+A checkpoint is ``NAME.safetensors``, a header of JSON and raw numbers, with ``manifest.json``
+beside it. Pickled checkpoints (``.pt``, ``.pth``) are programs and are not read at all.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load
+
+from gcar_deploy.errors import GeometryError, ModelError
+from gcar_deploy.files import read_bounded
+from gcar_deploy.geometry.fields import read_json
+
+#: weights and the optimiser's two moments of them, in single precision, of some 80 M weights
+MAX_BYTES = 2**30
+MAX_MANIFEST_BYTES = 64 * 2**10
+#: widest layer and most stages that a manifest may ask for
+MAX_WIDTH = 4096
+
+
+def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Read all tensors of a ``.safetensors`` file.
+
+    Raises
+    ------
+    ModelError
+        Another kind of file, damaged, larger than ``MAX_BYTES``, or values not finite.
+    """
+    if path.suffix != ".safetensors":
+        raise ModelError(f"checkpoint {path.name} is no .safetensors file; pickles are not read")
+    try:
+        tensors = load(read_bounded(path, MAX_BYTES))
+    except (ValueError, KeyError, OverflowError, MemoryError, SafetensorError, RuntimeError) as e:
+        raise ModelError(f"checkpoint {path.name} cannot be read: {_line(e)}") from None
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor.float()).all()):
+            raise ModelError(f"checkpoint {path.name}: {name[:60]!r} holds values not finite")
+    return tensors
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Read the ``manifest.json`` beside the checkpoint ``path``, strictly.
+
+    Raises
+    ------
+    ModelError
+        Missing, not JSON, or sizes of the network out of range.
+    """
+    file = path.parent / "manifest.json"
+    try:
+        found = read_json(read_bounded(file, MAX_MANIFEST_BYTES).decode("utf-8"))
+    except (ValueError, GeometryError) as error:
+        raise ModelError(f"{file.name} of {path.name} cannot be read: {_line(error)}") from None
+    if not isinstance(found, dict) or not isinstance(found.get("config"), dict):
+        raise ModelError(f"{file.name} of {path.name} has no config")
+    for key, value in found["config"].items():
+        for size in value if isinstance(value, list) else [value]:
+            whole = isinstance(size, int) and not isinstance(size, bool)
+            if whole and not 0 <= size <= MAX_WIDTH:
+                raise ModelError(f"{file.name}: config.{key[:40]} = {size} is not 0 .. {MAX_WIDTH}")
+    return found
+
+
+def filled(module: torch.nn.Module, tensors: dict[str, torch.Tensor], name: str) -> None:
+    """Put the ``net.`` tensors into ``module``; names and shapes must be exactly its own.
+
+    Raises
+    ------
+    ModelError
+    """
+    weights = {key[4:]: value for key, value in tensors.items() if key.startswith("net.")}
+    try:
+        module.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ModelError(f"{name} does not fit its manifest: {_line(error)}") from None
+
+
+def _line(error: Exception) -> str:
+    return re.sub(r"\s+", " ", str(error))[:200] or type(error).__name__

@@ -1,0 +1,44 @@
+"""The card of a model file: what it is, what it wants, what it was made from, how good it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gcar_deploy.predict.model_spec import ModelFile
+
+
+def card(model: ModelFile) -> list[str]:
+    """Return the card for people, one line a fact."""
+    spec = model.spec
+    training = spec.get("training", {})
+    what = {
+        "multi": "all views at once: which hull points are vessel",
+        "single": "the paper's: one view at a time, a depth and an offset per cell",
+    }[model.kind]
+    out = [
+        f"{model.name}: {model.kind}-view Gaussian centre predictor ({what})",
+        f"  SHA-256 {model.sha256}, as its spec says",
+        f"  {spec.get('parameters', 0):,} parameters, {len(model.data):,} bytes, "
+        f"{spec.get('precision', 'float32')}, opset {spec.get('opset')}, "
+        f"IR {spec.get('ir_version')}",
+        "  wants: " + ", ".join(f"{k} {v}" for k, v in model.inputs.items()),
+        f"  answers: {', '.join(spec.get('outputs', ()))}",
+        f"  cells or pixels of {_range(spec.get('spacing_mm'))} mm at the isocentre"
+        + (f"; {spec['geometry']}" if "geometry" in spec else ""),
+        f"  trained on: {training.get('data', 'unknown')}; seed "
+        f"{training.get('seed', training.get('options', {}).get('seed', '?'))}, "
+        f"{training.get('step', '?')} steps",
+    ]
+    for name, digest in training.get("labels", {}).items():
+        out.append(f"    label volume {name} {digest[:12]}")
+    for kind, scores in training.get("validation", {}).items():
+        shown = ", ".join(f"{key} {value:.3f}" for key, value in scores.items())
+        out.append(f"  {kind}, generated and held out: {shown}")
+    out.append(f"  licence: {spec.get('license', 'unknown')}")
+    out.append("  Research use only. Not a medical device.")
+    return out
+
+
+def _range(value: Any) -> str:
+    return f"{value[0]:g} .. {value[1]:g}" if isinstance(value, list) and len(value) == 2 else "any"

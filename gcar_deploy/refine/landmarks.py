@@ -1,0 +1,50 @@
+"""Landmarks: points that a person marked in several views, checked before they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcar_deploy.config import Landmark
+from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.types import Array
+
+
+def landmark_pixels(landmarks: Sequence[Landmark], carms: Sequence[CArm]) -> Array:
+    """Collect the landmarks as an array.
+
+    Parameters
+    ----------
+    landmarks : each with one (col, row) or None per view
+    carms : V views
+
+    Returns
+    -------
+    (m, V, 2) float64, nan where a view does not show it
+
+    Raises
+    ------
+    UsageError
+        A landmark has not one entry per view, lies outside its picture, or is marked only once.
+    """
+    out = np.full((len(landmarks), len(carms), 2), np.nan)
+    for m, landmark in enumerate(landmarks):
+        if len(landmark) != len(carms):
+            raise UsageError(
+                f"landmark {m + 1} has {len(landmark)} points for {len(carms)} views; "
+                "give one for each, - where it is not seen"
+            )
+        for k, (point, carm) in enumerate(zip(landmark, carms, strict=True)):
+            if point is None:
+                continue
+            if not (0 <= point[0] < carm.columns and 0 <= point[1] < carm.rows):
+                raise UsageError(
+                    f"landmark {m + 1}: ({point[0]:g}, {point[1]:g}) is outside the "
+                    f"{carm.columns} x {carm.rows} pixels (columns x rows) of view {k + 1}"
+                )
+            out[m, k] = point
+        if np.isfinite(out[m, :, 0]).sum() < 2:
+            raise UsageError(f"landmark {m + 1} is marked in one view; two or more are needed")
+    return out

@@ -1,0 +1,176 @@
+"""DICOM face of the worker: a storage service on the loopback interface (extra ``listen``).
+
+Angiography runs arrive by C-STORE; once a sender has let go and a study has enough of them, the
+study becomes one order. A sender elsewhere reaches the port through a tunnel or DICOM router.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import re
+import shutil
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pynetdicom import AE, evt
+
+from gcar_deploy.dicom.header import CLASSIC, ENHANCED, SYNTAXES
+from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.worker.jobs import Job, JobQueue
+from gcar_deploy.worker.orders import MOST_VIEWS, Order, new_scratch
+
+_log = logging.getLogger(__name__)
+LOOPBACK = "127.0.0.1"
+_VERIFICATION = "1.2.840.10008.1.1"
+#: C-STORE answers (PS3.4 B.2.3)
+SUCCESS, OUT_OF_RESOURCES, NOT_A_RUN = 0x0000, 0xA700, 0xA900
+_UID = re.compile(r"[0-9.]{1,64}")
+#: senders at a time, and studies that may wait for more runs
+MOST_SENDERS, MOST_STUDIES = 4, 64
+_SECONDS = 60
+
+
+@dataclasses.dataclass(eq=False)
+class Study:
+    """Runs of one study that have arrived: SOP instance UID to file."""
+
+    scratch: Path
+    runs: dict[str, Path] = dataclasses.field(default_factory=dict)
+
+
+class Listener:
+    """Receives runs and orders reconstructions.
+
+    Parameters
+    ----------
+    queue : does the orders
+    out : results go to ``out/STUDY_INSTANCE_UID`` (with ``-2``, ``-3`` ... if it exists)
+    title : application entity title that senders must call
+    runs : a study is ordered when it has so many
+    most_mib : the largest run
+    """
+
+    def __init__(
+        self, queue: JobQueue, out: Path, *, title: str, runs: int = 2, most_mib: int = 512
+    ) -> None:
+        if not 2 <= runs <= MOST_VIEWS:
+            raise UsageError(f"runs = {runs} must be 2 .. {MOST_VIEWS}")
+        self._queue, self._out = queue, out
+        self._title, self._wanted, self._most_bytes = title, runs, most_mib * 2**20
+        self._studies: dict[str, Study] = {}
+        self._lock = threading.Lock()
+        self._server: Any = None
+
+    def start(self, port: int) -> int:
+        """Bind the loopback interface; return the port (0 takes a free one).
+
+        Raises
+        ------
+        UsageError
+            The port is taken.
+        """
+        entity = AE(ae_title=self._title)
+        entity.require_called_aet = True
+        entity.maximum_associations = MOST_SENDERS
+        entity.acse_timeout = entity.dimse_timeout = entity.network_timeout = _SECONDS
+        for kind in (CLASSIC, ENHANCED):
+            entity.add_supported_context(kind, list(SYNTAXES))
+        entity.add_supported_context(_VERIFICATION)
+        handlers: list[Any] = [
+            (evt.EVT_C_STORE, self._store),
+            (evt.EVT_RELEASED, self._let_go),
+            (evt.EVT_ABORTED, self._let_go),
+            (evt.EVT_CONN_CLOSE, self._let_go),
+        ]
+        try:
+            self._server = entity.start_server((LOOPBACK, port), block=False, evt_handlers=handlers)
+        except OSError as error:
+            raise UsageError(f"port {port} cannot be used ({error.strerror})") from None
+        return int(self._server.server_address[1])
+
+    def stop(self) -> None:
+        """Close the port and drop what never became an order."""
+        if self._server is not None:
+            self._server.shutdown()
+        with self._lock:
+            studies, self._studies = self._studies, {}
+        for study in studies.values():
+            shutil.rmtree(study.scratch, ignore_errors=True)
+
+    def _store(self, event: Any) -> int:
+        """Keep one run as it came, not a bit of it changed."""
+        data = event.encoded_dataset()
+        if len(data) > self._most_bytes:
+            _log.warning("a run of %d MiB is too large", len(data) >> 20)
+            return OUT_OF_RESOURCES
+        instance = str(event.request.AffectedSOPInstanceUID)
+        try:
+            study = str(event.dataset.StudyInstanceUID)
+        except Exception:  # noqa: BLE001 - a damaged data set may raise anything
+            return NOT_A_RUN
+        if not (_UID.fullmatch(study) and _UID.fullmatch(instance)):
+            return NOT_A_RUN
+        with self._lock:
+            if study not in self._studies and len(self._studies) >= MOST_STUDIES:
+                return OUT_OF_RESOURCES
+            found = self._studies.setdefault(study, Study(new_scratch()))
+            if instance not in found.runs and len(found.runs) >= MOST_VIEWS:
+                return OUT_OF_RESOURCES
+            path = found.runs.setdefault(instance, found.scratch / f"run{len(found.runs) + 1}.dcm")
+            path.write_bytes(data)
+        _log.info("study %s: %s", study, path.name)
+        return SUCCESS
+
+    def _let_go(self, _: Any) -> None:
+        """Order every study that is complete; a sender is done, and no run is half there."""
+        with self._lock:
+            ready = [uid for uid, s in self._studies.items() if len(s.runs) >= self._wanted]
+            studies = {uid: self._studies.pop(uid) for uid in ready}
+            for uid, study in studies.items():
+                self._order(uid, study)
+
+    def _order(self, uid: str, study: Study) -> None:
+        order = Order(
+            views=tuple(study.runs.values()),
+            geometry=None,
+            out=self._free(uid),
+            scratch=study.scratch,
+        )
+        try:
+            self._queue.submit(order)
+        except GcarError as error:
+            _log.error("study %s: %s", uid, error)
+            shutil.rmtree(study.scratch, ignore_errors=True)
+
+    def _free(self, uid: str) -> Path:
+        path, number = self._out / uid, 1
+        while path.exists():
+            number += 1
+            path = self._out / f"{uid}-{number}"
+        return path
+
+
+def tell(write: Callable[[str], None]) -> Callable[[Job], None]:
+    """Return an ``on_change`` that writes one line of JSON for each finished study."""
+
+    def on_change(job: Job) -> None:
+        if job.open:
+            return
+        write(
+            json.dumps(
+                {
+                    "study": job.order.out.name if job.order.out else None,
+                    "state": job.state,
+                    "out": None if job.folder is None else str(job.folder),
+                    "status": None if job.summary is None else job.summary["status"],
+                    "error": job.error,
+                    "exit_code": job.exit_code or 0,
+                }
+            )
+        )
+
+    return on_change

@@ -1,0 +1,122 @@
+"""From a checkpoint of any size to ONNX: both networks, extremes, the task, int8, refusals."""
+
+import hashlib
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from gcar_deploy.errors import ModelError
+from gcar_deploy.predict.model_spec import read_model
+from gcar_export import parity as parity_module
+from gcar_export.export_onnx import load_checkpoint
+from gcar_export.networks.sparse import SparseConfig
+from gcar_export.networks.unet import UNetConfig
+from gcar_export.parity import Parity, accept, export_checked, parity
+from gcar_export.quantize import quantize_checked
+from gcar_export.task_check import task_measure, torch_predictor
+from gcar_export.tiny_model import TINY, TINY_SINGLE, write_tiny_checkpoint
+from gcar_export.verify import verify_model
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", params=["sparse", "unet"])
+def exported(request, tmp_path_factory):
+    """A tiny checkpoint of one network, exported and checked."""
+    folder = tmp_path_factory.mktemp(request.param)
+    checkpoint = write_tiny_checkpoint(folder, seed=3, network=request.param)
+    found = export_checked(checkpoint, folder / "m.onnx", inputs=9, task_scenes=2)
+    return checkpoint, folder / "m.onnx", found
+
+
+def test_a_checkpoint_of_another_size_goes_through(exported):
+    checkpoint, model, found = exported
+    config = load_checkpoint(checkpoint).config
+    assert config in (TINY, TINY_SINGLE) and config not in (SparseConfig(), UNetConfig())
+    assert found.inputs == 9 and found.worst < 1e-4 and found.decisions_equal > 0.9999
+    assert found.task_torch == pytest.approx(found.task_runtime, abs=1e-3)
+    spec = read_model(model).spec
+    assert spec["name"] == "m" and spec["opset"] == 18 and spec["ir_version"] == 10
+    assert spec["sha256"] == hashlib.sha256(model.read_bytes()).hexdigest()
+    assert {f.name for f in model.parent.iterdir()} == {
+        "checkpoint.safetensors", "manifest.json", "m.onnx", "m.json", "m.golden.npz",
+    }  # fmt: skip
+
+
+def test_card_of_the_file_is_that_of_the_spec(exported):
+    import onnx
+
+    graph = onnx.load(str(exported[1]))
+    card = {entry.key: entry.value for entry in graph.metadata_props}
+    spec = read_model(exported[1]).spec
+    assert card == {f"gcar.{k}": spec[k] for k in ("schema", "name", "kind", "license")}
+    assert graph.ir_version == 10 and graph.opset_import[0].version == 18
+    assert not any(t.data_location for t in graph.graph.initializer)
+
+
+def test_other_weights_are_noticed(exported, tmp_path):
+    checkpoint, model, _ = exported
+    data = load_file(checkpoint)
+    key = next(k for k in data if k.endswith("head.bias") or k.endswith("head.1.bias"))
+    data[key] = data[key] + 0.01
+    save_file(data, tmp_path / "checkpoint.safetensors")
+    (tmp_path / "manifest.json").write_text((checkpoint.parent / "manifest.json").read_text())
+    assert parity(tmp_path / "checkpoint.safetensors", model, 5).worst > 1e-4
+
+
+def test_a_graph_that_differs_leaves_no_file(tmp_path, monkeypatch):
+    checkpoint = write_tiny_checkpoint(tmp_path, network="unet")
+    monkeypatch.setattr(parity_module, "PARITY", -1.0)
+    with pytest.raises(ModelError, match="differs from its checkpoint"):
+        export_checked(checkpoint, tmp_path / "out" / "n.onnx", inputs=2, task_scenes=0)
+    assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (Parity(60, 2e-4, 1.0, 0.7, 0.7), "by 2.0e-04 of the range"),
+        (Parity(60, 1e-6, 0.9998, 0.7, 0.7), "99.9800% of decisions equal"),
+        (Parity(60, 1e-6, 1.0, 0.7, 0.69), "reaches 0.6900 through the runtime"),
+        (Parity(60, float("nan"), 1.0, 0.7, 0.7), "differs"),
+    ],
+)
+def test_what_is_refused_and_why(found, words):
+    with pytest.raises(ModelError, match=words):
+        accept("m.onnx", found)
+
+
+def test_task_is_measured_through_the_runtime(exported):
+    checkpoint, model, _ = exported
+    assert task_measure(torch_predictor(checkpoint, model), 1) == pytest.approx(
+        task_measure(read_model(model), 1), abs=1e-6
+    )
+    text = verify_model(model, 1)
+    assert "Dice at 0.5 on the hull" in text and read_model(model).sha256 in text
+
+
+def test_int8_is_kept_or_refused_with_figures(exported, monkeypatch):
+    model = exported[1]
+    before = model.read_bytes()
+    twin = model.with_name("m-int8.onnx")
+    monkeypatch.setattr("gcar_export.quantize.MOST_LOST", 0.5)
+    said = quantize_checked(model, scenes=1, calibration=2)
+    assert "int8 accepted, Dice 0." in said and read_model(twin).spec["precision"].startswith(
+        "int8"
+    )
+    monkeypatch.setattr("gcar_export.quantize.MOST_LOST", -1.0)
+    with pytest.raises(ModelError, match=r"int8 refused: Dice 0\.\d+ -> 0\.\d+ over 1 scenes"):
+        quantize_checked(model, scenes=1, calibration=2)
+    assert not twin.exists() and not twin.with_suffix(".json").exists()
+    assert model.read_bytes() == before
+
+
+@pytest.mark.parametrize("manifest", [None, "{", json.dumps({"network": "unet", "config": {}})])
+def test_a_checkpoint_without_a_usable_manifest_is_refused(tmp_path, manifest):
+    save_file({"step": torch.zeros(1)}, tmp_path / "c.safetensors")
+    if manifest is not None:
+        (tmp_path / "manifest.json").write_text(manifest)
+    with pytest.raises(ModelError, match=r"manifest\.json"):
+        load_checkpoint(tmp_path / "c.safetensors")

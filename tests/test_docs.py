@@ -1,0 +1,100 @@
+"""The documentation is there, true to the commands, and its example runs."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from tests.cli.conftest import good_case  # noqa: F401 - a fixture
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+@pytest.fixture(scope="module")
+def tool():
+    sys.path.insert(0, str(ROOT))
+    try:
+        from tools import command_reference
+    finally:
+        sys.path.remove(str(ROOT))
+    return command_reference
+
+
+def test_the_command_reference_is_up_to_date(tool):
+    """Otherwise: python -m tools.command_reference."""
+    assert (DOCS / "commands.md").read_text(encoding="utf-8") == tool.reference()
+
+
+def test_every_verb_and_option_is_documented(tool):
+    page = (DOCS / "commands.md").read_text(encoding="utf-8")
+    sections = dict(re.findall(r"^##+ `(.+?)`\n(.*?)(?=^##+ `|\Z)", page, re.MULTILINE | re.DOTALL))
+    seen = 0
+    for name, command in tool.commands():
+        assert name in sections, name
+        assert (command.help or "").strip(), f"{name} has no help"
+        for option in command.params:
+            if isinstance(option, click.Option):
+                assert all(f"`{o}`" in sections[name] for o in option.opts), (name, option.opts)
+                assert option.help or name.startswith("gcar-export"), (name, option.opts)
+                seen += 1
+    assert seen > 50
+
+
+def pages():
+    return sorted(DOCS.glob("*.md"))
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda p: p.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_every_exit_code_is_explained():
+    from gcar_deploy import errors
+
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    codes = {
+        value.exit_code
+        for value in vars(errors).values()
+        if isinstance(value, type) and issubclass(value, errors.GcarError)
+    }
+    for code in (0, *codes):
+        assert re.search(rf"^\| {code} \|", page, re.MULTILINE), code
+    assert "130, 143" in page
+
+
+def test_pictures_are_small():
+    sizes = {p.name: p.stat().st_size for p in (DOCS / "pictures").iterdir()}
+    assert max(sizes.values()) < 200_000 and sum(sizes.values()) < 1_000_000
+
+
+@pytest.mark.slow
+def test_the_python_host_runs_as_printed(good_case, tmp_path, monkeypatch, capsys):  # noqa: F811
+    code = re.findall(
+        r"```python\n(.*?)```", (DOCS / "host-guide.md").read_text("utf-8"), re.DOTALL
+    )
+    for file in good_case.iterdir():
+        shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code[0], "host-guide.md", "exec"), {})  # noqa: S102
+    assert (tmp_path / "result" / "report.html").is_file()
+    assert "mm" in capsys.readouterr().out
+
+
+def test_the_geometry_page_states_the_formulae_in_use():
+    from gcar_deploy.geometry.carm import CArm
+
+    carm = CArm(
+        primary_angle_deg=30, secondary_angle_deg=25, sod_mm=750, sdd_mm=1050, rows=512,
+        columns=512, pixel_spacing_mm=(0.2, 0.2),
+    )  # fmt: skip
+    pixels, depth = carm.project([[10.0, -20.0, 30.0]])
+    stated = f"pixel ({pixels[0, 0]:.3f}, {pixels[0, 1]:.3f}) at depth {depth[0]:.3f} mm"
+    assert stated in (DOCS / "geometry.md").read_text(encoding="utf-8")

@@ -1,0 +1,177 @@
+"""Runs sent by real storage clients become results; what is no run is turned away."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pydicom", reason="needs the dicom extra")
+pytest.importorskip("pynetdicom", reason="needs the listen extra")
+
+import pydicom
+from pydicom.uid import ExplicitVRLittleEndian, SecondaryCaptureImageStorage, generate_uid
+from pynetdicom import AE
+
+from gcar_deploy.dicom.header import CLASSIC
+from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.refine.tube_model import footprint, tubes_of
+from gcar_deploy.selftest import tiny_tree
+from gcar_deploy.worker.jobs import JobQueue
+from gcar_deploy.worker.listen import Listener, tell
+from tests.dicom.files import classic, save
+
+VERIFICATION = "1.2.840.10008.1.1"
+SIDE = 256
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two X-ray pictures of a small tree as XA files of one study."""
+    folder, study = tmp_path_factory.mktemp("runs"), generate_uid()
+    rng = np.random.default_rng(0)
+    files = []
+    for number, (primary, secondary) in enumerate(((-30, -20), (45, 25)), start=1):
+        carm = CArm(
+            primary_angle_deg=primary, secondary_angle_deg=secondary, sod_mm=765.0, sdd_mm=1100.0,
+            rows=SIDE, columns=SIDE, pixel_spacing_mm=(0.6, 0.6),
+        )  # fmt: skip
+        path = footprint(tubes_of(tiny_tree()), carm, 1.0).image((SIDE, SIDE))
+        grey = 190 * np.exp(-0.22 * path) + rng.normal(0, 1.5, path.shape)
+        run = classic(
+            np.rint(grey).clip(0, 255).astype(np.uint8)[None], StudyInstanceUID=study,
+            SeriesInstanceUID=generate_uid(), PositionerPrimaryAngle=str(primary),
+            PositionerSecondaryAngle=str(secondary), ImagerPixelSpacing=["0.6", "0.6"],
+        )  # fmt: skip
+        files.append(save(run, folder / f"run{number}.dcm"))
+    return study, files
+
+
+@pytest.fixture
+def listening(tmp_path):
+    """(port, orders that came, out); the orders are not worked on."""
+    orders, lines = [], []
+
+    def work(order, on_progress, cancel):
+        orders.append((order.out, [view.read_bytes() for view in order.views]))
+        return {"status": "ok"}, order.out
+
+    queue = JobQueue(work, on_change=tell(lines.append))
+    listener = Listener(queue, tmp_path, title="GCAR", most_mib=1)
+    yield listener.start(0), orders, lines, queue
+    listener.stop()
+    queue.close()
+
+
+def associate(port, *kinds, title="GCAR"):
+    entity = AE(ae_title="SENDER")
+    for kind in kinds or (CLASSIC, VERIFICATION):
+        entity.add_requested_context(kind, ExplicitVRLittleEndian)
+    return entity.associate("127.0.0.1", port, ae_title=title)
+
+
+def wait_for(queue, count):
+    end = time.monotonic() + 60
+    while sum(queue.counts().get(s, 0) for s in ("done", "failed")) < count:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_a_study_is_ordered_once_its_sender_lets_go(listening, runs, tmp_path):
+    port, orders, lines, queue = listening
+    study, files = runs
+    link = associate(port)
+    assert link.is_established and link.send_c_echo().Status == 0
+    data = [pydicom.dcmread(file) for file in files]
+    for one in (data[0], data[0], data[1]):
+        assert link.send_c_store(one).Status == 0
+    assert orders == []
+    link.release()
+    wait_for(queue, 1)
+    ((out, views),) = orders
+    assert out == tmp_path / study and len(views) == 2
+    assert [pydicom.dcmread(io.BytesIO(v)).PixelData for v in views] == [d.PixelData for d in data]
+    assert json.loads(lines[0]) == {
+        "study": study, "state": "done", "out": str(tmp_path / study), "status": "ok",
+        "error": None, "exit_code": 0,
+    }  # fmt: skip
+
+
+def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, tmp_path):
+    port, orders, _, queue = listening
+    study, files = runs
+    (tmp_path / study).mkdir()
+    for file in files:
+        link = associate(port)
+        assert link.send_c_store(pydicom.dcmread(file)).Status == 0
+        link.release()
+    wait_for(queue, 1)
+    assert orders[0][0] == tmp_path / f"{study}-2"
+
+
+@pytest.mark.filterwarnings("ignore:Invalid value for VR UI")
+def test_what_is_no_run_is_turned_away(listening, runs):
+    port, orders, _, _ = listening
+    assert not associate(port, title="SOMEONE").is_established
+    assert not associate(port, SecondaryCaptureImageStorage).is_established
+    link = associate(port)
+    big = classic(np.zeros((1, 1200, 1200), np.uint8), StudyInstanceUID=generate_uid())
+    assert link.send_c_store(big).Status == 0xA700
+    assert link.send_c_store(classic()).Status == 0xA900
+    crooked = pydicom.dcmread(runs[1][0])
+    crooked.StudyInstanceUID = "../../etc"
+    assert link.send_c_store(crooked).Status == 0xA900
+    link.release()
+    assert orders == []
+
+
+def test_wrong_calls(tmp_path, listening):
+    port, _, _, queue = listening
+    with pytest.raises(UsageError, match="runs = 1"):
+        Listener(queue, tmp_path, title="GCAR", runs=1)
+    with pytest.raises(UsageError, match=f"port {port}"):
+        Listener(queue, tmp_path, title="GCAR").start(port)
+
+
+SENDERS = {
+    "pynetdicom": [sys.executable, "-m", "pynetdicom", "storescu"],
+    "dcmtk": [shutil.which("storescu")],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sender", SENDERS)
+def test_from_storescu_to_report(runs, tmp_path, sender):
+    study, files = runs
+    command = SENDERS[sender]
+    if command[0] is None:
+        pytest.skip("no storescu of DCMTK")
+    listener = subprocess.Popen(
+        [sys.executable, "-m", "gcar_deploy.cli.main", "listen", "--out", tmp_path, "--port", "0",
+         "--predictor", "none", "--once"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert listener.stderr
+    port = re.fullmatch(r"gcar: GCAR on 127\.0\.0\.1:(\d+)\n", listener.stderr.readline())
+    assert port
+    called = ["-aec", "GCAR", "127.0.0.1", port[1]]
+    # DCMTK names the contexts that it offers, pynetdicom reads them from the files.
+    extra = ["-cx"] if sender == "pynetdicom" else ["-R"]
+    sent = subprocess.run(
+        [*command, *extra, *called, *map(str, files)], capture_output=True, text=True, timeout=120
+    )
+    assert sent.returncode == 0, sent.stderr
+    out, err = listener.communicate(timeout=300)
+    assert listener.returncode == 0, err
+    told = json.loads(out)
+    assert told["study"] == study and told["state"] == "done", told
+    assert (tmp_path / study / "report.html").is_file()
+    assert [p.name for p in tmp_path.iterdir()] == [study]

@@ -1,0 +1,1 @@
+"""Tools of the project itself: command reference, battery, requirements, bill of materials."""

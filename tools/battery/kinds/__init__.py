@@ -1,0 +1,1 @@
+"""What is damaged: one module a kind, each with ``make(seed) -> Case`` (see ``pool``)."""
