@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
@@ -75,7 +75,7 @@ class Engine:
         if threads is not None and threads < 1:
             raise UsageError(f"threads = {threads} must be 1 or more")
         self.threads = threads or min(os.cpu_count() or 1, 4)
-        self._predictor = _load(model, self.options.predict.predictor, self.threads, session)
+        self._predictor = _load(model, self.options.predict, self.threads, session)
         self._notes: tuple[str, ...] = ()
         if self._predictor is None and self.options.predict.predictor != "none":
             self._notes = (_missing(self.options.predict.predictor),)
@@ -333,7 +333,10 @@ def _scene(geometry: Geometry) -> Scene:
     raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")
 
 
-def _load(model: str | Path | None, wanted: str, threads: int, session: Any) -> Predictor | None:
+def _load(
+    model: str | Path | None, options: PredictOptions, threads: int, session: Any
+) -> Predictor | None:
+    wanted = options.predictor
     if wanted not in PREDICTORS:
         raise UsageError(f"predictor = {wanted!r} is none of {', '.join(PREDICTORS)}")
     if wanted == "none":
@@ -344,7 +347,7 @@ def _load(model: str | Path | None, wanted: str, threads: int, session: Any) -> 
     if path is None:
         _log.info("%s", _missing(wanted))
         return None
-    file = read_model(path)
+    file = read_model(path, options.limits)
     if wanted not in ("auto", file.kind):
         raise ModelError(f"model {file.name} is of kind {file.kind}, not {wanted}")
     return open_predictor(file, threads=threads, session=session)

@@ -99,6 +99,6 @@ def test_every_bug_of_the_mutation_check_can_still_be_put_in():
     }  # fmt: skip
     for mutant in MUTANTS:
         text = (ROOT / mutant.file).read_text(encoding="utf-8")
-        assert text.count(mutant.old) == 1, mutant.name
+        assert mutant.old in text, mutant.name
         for test in mutant.tests:
             assert (ROOT / test.partition("::")[0]).is_file(), mutant.name

@@ -14,7 +14,7 @@ import pytest
 
 from gcar_deploy.config import ModelLimits
 from gcar_deploy.errors import ModelError, UsageError
-from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.center_predictor import CenterPredictor, open_predictor
 from gcar_deploy.predict.golden import golden_path, read_golden
 from gcar_deploy.predict.model_spec import read_model, shipped_model_path
 
@@ -48,7 +48,7 @@ def test_every_shipped_model_has_one_and_keeps_it():
     for model in sorted(shipped.parent.glob("*.onnx")):
         found = read_model(model)
         assert found.golden is not None, f"{model.name}: gcar-export golden {model.name}"
-        worst = CenterPredictor(found, threads=1).check_golden()
+        worst = open_predictor(found, threads=1).check_golden()
         assert worst is not None and worst < 1e-4
 
 

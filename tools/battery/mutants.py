@@ -16,7 +16,7 @@ class Mutant:
     ----------
     name : what it does
     file : path in the repository
-    old, new : text that occurs exactly once, and what stands there instead
+    old, new : text, and what stands there instead (wherever it occurs in the file)
     tests : files or names of tests; at least one must fail
     """
 

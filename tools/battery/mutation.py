@@ -68,7 +68,7 @@ def _tried(copy: Path, mutant: Mutant) -> str:
     source = mutant.file.split("/", 1)
     file = copy / _FOLDERS[source[0]] / source[1]
     good = file.read_text(encoding="utf-8")
-    if good.count(mutant.old) != 1:
+    if mutant.old not in good:
         return "NOT FOUND"
     file.write_text(good.replace(mutant.old, mutant.new), encoding="utf-8")
     try:

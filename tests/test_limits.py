@@ -1,0 +1,34 @@
+"""Limits are written down, and can be changed by whoever knows where the files come from."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from gcar_deploy.config import (
+    DicomLimits,
+    ModelLimits,
+    PictureLimits,
+    PredictOptions,
+    RunOptions,
+)
+from gcar_deploy.engine import Engine
+from gcar_deploy.errors import ModelError
+
+TEXT = (Path(__file__).parents[1] / "docs" / "limits.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.req("REQ-49")
+@pytest.mark.parametrize("limits", [PictureLimits, DicomLimits, ModelLimits])
+def test_every_limit_is_in_the_table(limits):
+    for field in dataclasses.fields(limits):
+        assert field.name in TEXT, f"docs/limits.md: {limits.__name__}.{field.name}"
+
+
+@pytest.mark.req("REQ-49")
+def test_an_engine_with_other_limits_refuses_by_them():
+    tight = PredictOptions(limits=ModelLimits(max_nodes=1))
+    with pytest.raises(ModelError, match="more than 1 nodes"):
+        Engine(options=RunOptions(predict=tight))
