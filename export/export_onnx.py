@@ -161,10 +161,7 @@ def _spec(net: torch.nn.Module, manifest: dict[str, Any], name: str) -> dict[str
             "geometry": "2 views or more, 25 .. 155 deg apart",
         }
     config = net.config
-    usual = ", ".join(
-        f"{f'LAO {a}' if a > 0 else f'RAO {-a}' if a else 'AP'} {'CRA' if b > 0 else 'CAU'} {abs(b)}"
-        for a, b in USUAL_VIEWS
-    )
+    usual = ", ".join(_view_name(a, b) for a, b in USUAL_VIEWS)
     return spec | {
         "kind": "single",
         "inputs": {
@@ -180,6 +177,12 @@ def _spec(net: torch.nn.Module, manifest: dict[str, Any], name: str) -> dict[str
         "geometry": f"the paper's two views; {usual}, give or take {USUAL_SPREAD_DEG:g} deg, "
         "SOD 700 .. 820 mm",
     }
+
+
+def _view_name(primary: float, secondary: float) -> str:
+    """Name a direction as it is said in the room."""
+    first = "AP" if not primary else f"{'LAO' if primary > 0 else 'RAO'} {abs(primary)}"
+    return f"{first} {'CRA' if secondary > 0 else 'CAU'} {abs(secondary)}"
 
 
 def finish(out: Path, spec: dict[str, Any]) -> dict[str, Any]:
