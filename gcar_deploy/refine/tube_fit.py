@@ -28,7 +28,6 @@ from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
-
 #: error of a tube between the pixels, as a share of the coarsest pixel at the isocentre. Chosen
 #: on generated trees (``gcar-export sigma-table --seed 1``), to be judged on another seed
 PIXEL_SHARE = 0.45
