@@ -298,3 +298,33 @@ def pose_table(trees: int, out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     rows = study.measure(out, trees, progress=lambda text: click.echo(text, err=True))
     click.echo(study.markdown(rows))
+
+
+@main.command("train-segmenter")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
+@click.option("--steps", default=1500, show_default=True, help="Steps in all.")
+@click.option("--decay-steps", default=600, show_default=True, help="Length of the final decay.")
+@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
+def train_segmenter(out: Path, steps: int, decay_steps: int, minutes: float | None) -> None:
+    """Train the segmentation network on generated angiograms; stop and go on at will.
+
+    Example: gcar-export train-segmenter --out runs/s --minutes 45
+    """
+    from gcar_export import train_segmenter as training
+
+    options = training.SegmenterOptions(steps=steps, decay_steps=decay_steps)
+    training.train(out, options, minutes=minutes)
+
+
+@main.command("export-segmenter")
+@click.argument("checkpoint", type=_FILE)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
+def export_segmenter(checkpoint: Path, out: Path) -> None:
+    """Turn the segmentation network's CHECKPOINT into one ONNX file with its spec, and prove it.
+
+    Example: gcar-export export-segmenter runs/s/checkpoint.safetensors --out segmenter.onnx
+    """
+    from gcar_export import export_segmenter as exporting
+
+    worst = exporting.export_segmenter(checkpoint, out)
+    click.echo(f"{out}: largest difference of a probability {worst:.1e}")
