@@ -26,6 +26,7 @@ from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.center_predictor import Predictor, open_predictor
+from gcar_deploy.predict.golden import check_golden
 from gcar_deploy.predict.model_spec import (
     SEGMENTER_MODEL,
     SHIPPED,
@@ -260,7 +261,10 @@ def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
     if path is None:
         raise ModelError("no segmentation network is installed with this version; use classic")
     model = read_model(path, wanted=SEGMENTER_INPUT)
-    return Segmenter(model.data, model.name, threads=threads)
+    segmenter = Segmenter(model.data, model.name, threads=threads)
+    if model.golden is not None:
+        check_golden(model.name, model.golden, segmenter.run, model.limits)
+    return segmenter
 
 
 def _from_headers(

@@ -7,6 +7,7 @@ pictures, whatever the display did to the grey values.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -85,6 +86,25 @@ class Segmenter:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
             raise ModelError(f"model {name} does not load: {reason}") from None
 
+    def run(self, outputs: Sequence[str] | None, feed: Mapping[str, Array]) -> list[Array]:
+        """Run the graph on named inputs.
+
+        Raises
+        ------
+        ModelError
+            It cannot run on them.
+        """
+        try:
+            found: list[Array] = self._session.run(outputs, dict(feed))
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+            raise ModelError(f"model {self.name} fails: {reason}") from None
+        return found
+
+    def output_names(self) -> list[str]:
+        """Names of the graph's outputs."""
+        return [node.name for node in self._session.get_outputs()]
+
     def probability(self, channels: Array) -> Image:
         """Return the vessel probability of each pixel.
 
@@ -106,7 +126,7 @@ class Segmenter:
         padded = np.stack(
             [cv2.copyMakeBorder(c, 0, down, 0, right, cv2.BORDER_REPLICATE) for c in channels]
         )
-        out = self._session.run(None, {"channels": padded[None]})[0]
+        out = self.run(None, {"channels": padded[None]})[0]
         if out.shape != (1, 1, rows + down, cols + right) or not np.isfinite(out).all():
             raise NumericalError(f"model {self.name} returned values that are not finite")
         return np.asarray(out[0, 0, :rows, :cols], dtype=np.float32)
