@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_export.cli_centers import centers_table, robustness
 from gcar_export.cli_evaluate import converge, evaluate
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -247,5 +248,44 @@ def lumen_table(data: Path | None, count: int) -> None:
 
 
 # Verbs with files of their own.
-for _verb in (evaluate, converge):
+for _verb in (evaluate, converge, centers_table, robustness):
     main.add_command(_verb)
+
+
+@main.command()
+@click.option("--data", type=_FOLDER, required=True, help="Folder with phantom_xa/.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="New folder.")
+@click.option("--landmarks", type=_FILE, help="JSON of landmarks marked in the four views.")
+def phantom(data: Path, out: Path, landmarks: Path | None) -> None:
+    """Fit some real X-ray runs of a phantom, predict the others; tables and a page.
+
+    Example: gcar-export phantom --data data --out phantom
+    """
+    from gcar_export import phantom as study
+    from gcar_export.phantom_page import markdown, write_page
+
+    if out.exists() and any(out.iterdir()):
+        raise UsageError(f"{out} exists and is not empty")
+    found, fits = study.run(data, landmarks, lambda text: click.echo(text, err=True))
+    out.mkdir(parents=True, exist_ok=True)
+    text = markdown(fits)
+    (out / "table.md").write_text(text + "\n", encoding="utf-8")
+    click.echo(text)
+    click.echo(write_page(found, fits, out))
+
+
+@main.command("pose-table")
+@click.option("--trees", default=3, show_default=True, help="Generated trees.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows (JSON lines).")
+def pose_table(trees: int, out: Path) -> None:
+    """Measure trees from a second view that is off, with and without pose refinement.
+
+    Goes on where an earlier run with the same --out stopped.
+
+    Example: gcar-export pose-table --trees 3 --out pose.jsonl
+    """
+    from gcar_export import pose_table as study
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    rows = study.measure(out, trees, progress=lambda text: click.echo(text, err=True))
+    click.echo(study.markdown(rows))

@@ -184,6 +184,28 @@ def needs_extra(extra: str, *packages: str) -> Iterator[None]:
         raise UsageError(f"{error.name} is not installed: pip install 'gcar[{extra}]'") from None
 
 
+def backend_options(function: _Function) -> _Function:
+    """Add what the paper's refiner computes with."""
+    for option in (
+        click.option(
+            "--backend",
+            type=click.Choice(["numpy", "torch"]),
+            default="numpy",
+            show_default=True,
+            help="What the paper's refiner computes with; torch is its twin (extra torch).",
+        ),
+        click.option(
+            "--device",
+            type=click.Choice(["cpu", "cuda"]),
+            default="cpu",
+            show_default=True,
+            help="Where torch computes.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
 @contextlib.contextmanager
 def refusals_as_json(wanted: bool) -> Iterator[None]:
     """With --json, a solve that is refused or fails is an object on stdout as well."""
@@ -204,15 +226,32 @@ def refusals_as_json(wanted: bool) -> Iterator[None]:
         raise
 
 
-def run_options(predictor: str, refiner: str) -> Any:
-    """Return RunOptions with the two choices made."""
+def run_options(predictor: str, refiner: str, backend: str = "numpy", device: str = "cpu") -> Any:
+    """Return RunOptions with these choices made.
+
+    Raises
+    ------
+    UsageError
+        A backend for a refiner that has only one, or one that is not there.
+    """
     import dataclasses
 
     from gcar_deploy.config import RunOptions
+    from gcar_deploy.errors import UsageError
 
+    if (backend, device) != ("numpy", "cpu"):
+        if refiner != "paper":
+            raise UsageError(
+                f"--backend {backend} --device {device} is for --refiner paper; "
+                f"the refiner {refiner} computes with numpy on cpu"
+            )
+        from gcar_deploy.gaussians.backends import backend_named
+
+        backend_named(backend, device)
     options = RunOptions()
+    paper = dataclasses.replace(options.refine.paper, backend=backend, device=device)
     return dataclasses.replace(
         options,
         predict=dataclasses.replace(options.predict, predictor=predictor),
-        refine=dataclasses.replace(options.refine, refiner=refiner),
+        refine=dataclasses.replace(options.refine, refiner=refiner, paper=paper),
     )

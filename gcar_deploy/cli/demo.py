@@ -11,6 +11,7 @@ import click
 
 from gcar_deploy.cli.common import (
     ProgressBar,
+    backend_options,
     engine_options,
     limit_threads,
     output_options,
@@ -29,6 +30,7 @@ from gcar_deploy.cli.common import (
     help="New folder.",
 )
 @engine_options
+@backend_options
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
 @output_options
 def demo(
@@ -38,6 +40,8 @@ def demo(
     refiner: str,
     deadline: float | None,
     threads: int | None,
+    backend: str,
+    device: str,
     force: bool,
     verbose: bool,
     quiet: bool,
@@ -63,7 +67,9 @@ def demo(
     from gcar_deploy.metrics import volume_measures
 
     case = demo_case()
-    engine = Engine(model, threads=threads, options=run_options(predictor, refiner))
+    engine = Engine(
+        model, threads=threads, options=run_options(predictor, refiner, backend, device)
+    )
     with ProgressBar(quiet=quiet) as bar:
         result = engine.reconstruct(
             case.pictures, case.geometry, on_progress=bar, deadline_s=deadline

@@ -11,6 +11,7 @@ import click
 
 from gcar_deploy.cli.common import (
     ProgressBar,
+    backend_options,
     chosen_dicom,
     dicom_options,
     engine_options,
@@ -36,6 +37,7 @@ from gcar_deploy.cli.hints import given_masks, hint_options, hinted
     "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
 )
 @engine_options
+@backend_options
 @dicom_options
 @hint_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
@@ -54,6 +56,8 @@ def run(
     refiner: str,
     deadline: float | None,
     threads: int | None,
+    backend: str,
+    device: str,
     frame: str,
     spacing: float | None,
     sod: float | None,
@@ -89,7 +93,7 @@ def run(
 
     extras = [name for name, wanted in (("glb", glb), ("dicom-stl", dicom_stl)) if wanted]
     check_extras(extras)
-    options = run_options(predictor, refiner)
+    options = run_options(predictor, refiner, backend, device)
     options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
     options = hinted(options, hints)
     engine = Engine(model, threads=threads, options=options)

@@ -92,7 +92,12 @@ def serve(
     set_up_logging(verbose, quiet=False)
     limit_threads(threads)
     limit_memory(memory_mib)
-    token = None if stdio else read_token(token_file)
+    token = None
+    if not stdio:
+        token = read_token(token_file)
+        with needs_extra("serve", "flask", "waitress", "werkzeug"):
+            # Found out before the engine takes its seconds.
+            import gcar_deploy.worker.http  # noqa: F401
     # SIGTERM, like Ctrl-C, ends a server in good order.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from gcar_deploy.engine import Engine
@@ -134,8 +139,8 @@ def _serve_lines(make_queue: Any, allowed: Any) -> None:
 
 def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib: int) -> None:
     try:
-        with needs_extra("serve", "flask", "waitress"):
-            from gcar_deploy.worker.http import LOOPBACK, create_app, listen
+        from gcar_deploy.worker.http import LOOPBACK, create_app, listen
+
         fresh = token is None
         token = token or secrets.token_urlsafe(32)
         server = listen(create_app(queue, token, folder=allowed, body_mib=body_mib), port)

@@ -193,8 +193,10 @@ def _open(model: ModelFile, threads: int) -> ort.InferenceSession:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    # A large first scene would otherwise keep its memory for good.
-    options.enable_cpu_mem_arena = False
+    # The arena makes inference a quarter faster. Memory patterns, planned anew for each number of
+    # points, add two thirds to its peak and nothing to its speed.
+    options.enable_cpu_mem_arena = True
+    options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return ort.InferenceSession(model.data, options, providers=["CPUExecutionProvider"])

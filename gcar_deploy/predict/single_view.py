@@ -4,7 +4,7 @@ A view's centre lies somewhere along its ray, some ten cells off (monocular dept
 hull point is a place where the rays of all views meet. So each hull point is believed as far as
 every view's predicted depth speaks for it,
 
-    start_i = prod_views 1 / (1 + ((t_i - t_view) / scale)^2)
+    start_i = 1/2 prod_views 1 / (1 + ((t_i - t_view) / scale)^2)^2
 
 with t_i its distance from the view's source and t_view the predicted one of its cell, and the
 paths of all rays are then shared out from there (``thin_hull``), which keeps what is believed
@@ -73,5 +73,6 @@ def agreement(view: ViewCenters, points_mm: Points, options: SingleViewOptions) 
     cell = np.clip(np.rint((pixels + 0.5) / view.alpha - 0.5), 0, m - 1).astype(np.int64)
     row, col = nearest[:, cell[:, 1], cell[:, 0]]
     wrong = np.linalg.norm(points_mm - source, axis=1) - distance[row, col]
-    out: Scalars = 1.0 / (1.0 + (wrong / (options.depth_scale_pixels * picture.pixel_mm)) ** 2)
+    off = wrong / (options.depth_scale_pixels * picture.pixel_mm)
+    out: Scalars = (1.0 + off**2) ** -2
     return out

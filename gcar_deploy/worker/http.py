@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from flask import Flask, Response, jsonify, request, send_from_directory, url_for
+from waitress import create_server
 from werkzeug.datastructures import FileStorage
 from werkzeug.exceptions import HTTPException
 
@@ -294,8 +295,6 @@ def listen(app: Flask, port: int) -> Any:
     UsageError
         The port is taken.
     """
-    from waitress import create_server
-
     try:
         return create_server(
             app,

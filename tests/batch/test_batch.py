@@ -135,10 +135,14 @@ def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_on_a_dask_cluster(table, tmp_path):
+def test_on_a_dask_cluster(table, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    # A busy machine is slow to start a cluster.
+    monkeypatch.setattr(pools, "CONNECT_S", 240)
     cases = [case for case in read_cases(table) if case.name in ("good-1", "missing")]
-    with distributed.LocalCluster(
+    patience = dask.config.set({"distributed.comm.timeouts.connect": "240s"})
+    with patience, distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
         dashboard_address=None, worker_dashboard_address=None,
     ) as cluster:  # fmt: skip

@@ -63,3 +63,24 @@ def test_tokens_from_the_environment_and_files(tmp_path, monkeypatch):
 def test_a_folder_that_is_none_is_refused(tmp_path):
     done = gcar("serve", "--folder", tmp_path / "absent", "--stdio", "--predictor", "none")
     assert done.code == 2 and "not a folder" in done.err
+
+
+@pytest.mark.parametrize(
+    ("verb", "library", "extra"),
+    [
+        (("serve",), "flask", "serve"),
+        (("serve",), "waitress", "serve"),
+        (("listen", "--out", "results"), "pynetdicom", "listen"),
+    ],
+)
+def test_a_missing_extra_is_one_line(verb, library, extra, tmp_path):
+    """Told before anything is loaded or made."""
+    code = (
+        f"import sys; sys.modules[{library!r}] = None\n"
+        f"from gcar_deploy.cli.main import main; main({list(verb)!r})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2 and f"pip install 'gcar[{extra}]'" in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ from gcar_export.baselines.nerp import NerpOptions, nerp, ray_matrix, seen_voxel
 from gcar_export.raycast import raycast
 from tests.export.test_baselines import GRID, carm, pictures, tree  # noqa: F401
 
-SMALL = NerpOptions(features=32, width=32, hidden_layers=2, steps=150, bandwidth=5.0)
+SMALL = NerpOptions(features=32, width=32, hidden_layers=2, steps=120, bandwidth=5.0)
 
 
 @pytest.mark.parametrize("view", [carm(-30, -20), carm(45, 25, detector_rotation_deg=15)])
@@ -34,8 +34,8 @@ def test_voxels_that_a_view_rules_out_are_not_asked(tree):  # noqa: F811
 def test_network_finds_the_tree_and_the_same_one_again(tree):  # noqa: F811
     losses = []
     found = nerp(*pictures(tree, 6), GRID, SMALL, lambda step, loss, volume: losses.append(loss))
-    assert best_dice(tree.occupancy, found)[0].value > 0.8
-    assert losses[-1] < 0.1 * losses[0]
+    assert best_dice(tree.occupancy, found)[0].value > 0.7
+    assert losses[-1] < 0.2 * losses[0]
     assert np.array_equal(found, nerp(*pictures(tree, 6), GRID, SMALL))
 
 

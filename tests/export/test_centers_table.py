@@ -1,0 +1,87 @@
+"""Scores of predicted centres in closed form, the table on a real tree, memory of a process."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from gcar_deploy.errors import ModelError, UsageError
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.predict.center_predictor import open_predictor
+from gcar_deploy.predict.model_spec import read_model
+from gcar_export import centers_table
+from gcar_export.centers import Truth
+from gcar_export.centers_table import Cost, Row, open_models, table
+from gcar_export.cli import main
+from gcar_export.golden import golden_inputs
+from gcar_export.predictor_process import peak_mib
+from tests.conftest import data_dir
+from tests.predict.test_single_view import TINY
+
+GRID = Grid(center_mm=(0, 0, 0), size_mm=(40, 40, 40), shape=(40, 40, 40))
+
+
+@pytest.fixture
+def tube():
+    """A straight vessel of 3 x 3 voxels along x, from -15.5 to 14.5 mm."""
+    volume = np.zeros(GRID.shape, np.float32)
+    volume[4:35, 19:22, 19:22] = 1
+    return Truth.of(volume, GRID)
+
+
+def test_scores_count_both_ways(tube):
+    line = tube.centerline
+    assert np.ptp(line[:, 0]) > 25 and np.ptp(line[:, 1]) < 1
+    assert tube.scores(line, 1.5) == (1.0, 1.0)
+    # Two voxels beside the rim: near nothing.
+    assert tube.scores(line + np.array([0, 3.6, 0]), 1.5) == (0.0, 0.0)
+    half = line[line[:, 0] < np.median(line[:, 0])]
+    precision, recall = tube.scores(np.concatenate([half, half + np.array([0, 9, 0])]), 1.5)
+    assert precision == pytest.approx(0.5) and recall == pytest.approx(0.5, abs=0.08)
+
+
+def test_no_centre_is_no_precision_and_no_recall(tube):
+    precision, recall = tube.scores(np.zeros((0, 3)), 1.5)
+    assert np.isnan(precision) and recall == 0
+
+
+def test_table_has_a_row_per_predictor_and_its_cost():
+    rows = [Row("a", "single", 0.5, 0.25, 90), Row("b", "single", 0.7, 0.75, 110),
+            Row("a", "multi", 1.0, 1.0, 100)]  # fmt: skip
+    text = table(rows, [Cost("multi", 1.5, 0.3, 0.2, 230.4)], "paper")
+    assert "| multi (n=1) | 100.0 ± 0.0 | 100.0 ± 0.0 |" in text
+    assert (
+        "| single (n=2) | 60.0 ± 14.1 | 50.0 ± 35.4 | 50.0 .. 70.0 / 25.0 .. 75.0 | 100 |" in text
+    )
+    assert text.index("| multi (n=1)") < text.index("| single (n=2)")
+    assert "| multi | 1.50 | 0.300 | 0.200 | 230 |" in text
+
+
+def test_models_by_kind_or_path(monkeypatch, tmp_path):
+    (path, predictor), = open_models([str(TINY)])  # fmt: skip
+    assert path == TINY and predictor.model.kind == "single"
+    with pytest.raises(ModelError, match=r"none\.onnx"):
+        open_models([str(tmp_path / "none.onnx")])
+    monkeypatch.setattr(centers_table, "shipped_model_path", lambda name: None)
+    with pytest.raises(UsageError, match="no single model is installed"):
+        open_models(["single"])
+
+
+def test_a_process_with_only_the_predictor_stays_small():
+    model = open_predictor(read_model(TINY)).model
+    peak = peak_mib(TINY, golden_inputs(model))
+    assert 20 < peak < 400
+
+
+@pytest.mark.slow
+def test_real_tree_through_the_command():
+    args = ["centers-table", "--data", str(data_dir() / "data"), "--cases", "0001", "--no-cost"]
+    done = CliRunner().invoke(main, args)
+    assert done.exit_code == 0, done.output
+    lines = {line.split("|")[1].split("(")[0].strip(): line for line in done.output.splitlines()
+             if "(n=1)" in line}  # fmt: skip
+    assert list(lines) == ["multi", "single", "single, each view"]
+    precision, recall = (float(lines["multi"].split("|")[k].split("±")[0]) for k in (2, 3))
+    assert precision > 90 and recall > 90
+    alone, merged = (float(lines[k].split("|")[2].split("±")[0])
+                     for k in ("single, each view", "single"))  # fmt: skip
+    assert alone < merged < precision

@@ -1,0 +1,55 @@
+"""The phantom study: a shift that was made is found, and the real runs keep their figures."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the export extra")
+pytest.importorskip("pydicom", reason="needs the dicom extra")
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.errors import UsageError
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.selftest import tiny_case
+from gcar_export.phantom import estimate_shift, load, predict, read_landmarks
+from tests.conftest import data_dir
+
+
+def test_a_shift_in_the_picture_plane_is_found():
+    angiograms, _, tree = tiny_case()
+    view = extract_vessels(angiograms[0], ImagingOptions())
+    u, v, d = view.carm.axes
+    told = view.carm.moved(-7.0 * u + 4.0 * v)
+    shift = estimate_shift(told, view.skeleton, tree)
+    assert shift @ u == pytest.approx(7.0, abs=0.7) and shift @ v == pytest.approx(-4.0, abs=0.7)
+    assert shift @ d == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_run_is_predicted_by_its_own_tree():
+    angiograms, _, tree = tiny_case()
+    found = predict("1", extract_vessels(angiograms[0], ImagingOptions()), tree)
+    assert found.share > 0.97 and found.back_share > 0.97 and found.median_px < 1.0
+    assert found.shift_mm < 1.0
+
+
+def test_landmark_file(tmp_path):
+    path = tmp_path / "marks.json"
+    path.write_text(json.dumps({"pixels_col_row": {"A": [[1, 2], [3, 4]], "B": [[5, 6], [7, 8]]}}))
+    assert read_landmarks(path, ["A", "B"]) == (((1, 2), (5, 6)), ((3, 4), (7, 8)))
+    with pytest.raises(UsageError, match=r"marks\.json"):
+        read_landmarks(path, ["A", "C"])
+
+
+def test_a_folder_without_the_runs(tmp_path):
+    with pytest.raises(UsageError, match="phantom_xa"):
+        load(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_real_runs_have_skeletons_and_a_surface():
+    phantom = load(data_dir())
+    assert set(phantom.angiograms) == {"IM1", "IM2", "IM3", "IM4", "IM7", "IM8"}
+    for view in phantom.vessels.values():
+        assert view.skeleton.sum() * view.carm.pixel_at_isocenter_mm > 150
+    assert np.ptp(phantom.surface_points, axis=0) == pytest.approx([120.5, 110.7, 110.0], abs=1.5)
