@@ -43,7 +43,10 @@ def centers_table(data: Path, protocol: str, models: str, cases: str, no_cost: b
 @click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
 @_CASES
 @click.option(
-    "--curves", default="separation,angle,shift,mask", show_default=True, help="Comma-separated."
+    "--curves",
+    default="separation,angle,shift,mask,gaps",
+    show_default=True,
+    help="Comma-separated.",
 )
 @click.option(
     "--model", type=click.Path(path_type=Path), help="ONNX file; the shipped one without."

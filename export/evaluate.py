@@ -8,10 +8,11 @@ in unsaid.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -147,11 +148,13 @@ def evaluate(
     done = len(jobs) - len(missing)
     if on_progress is not None and done:
         on_progress(done, len(jobs), f"{done} rows kept")
-    for job, outcome in _outcomes(missing, options):
-        write_done(options.out, job, outcome)
-        done += 1
-        if on_progress is not None:
-            on_progress(done, len(jobs), job.name)
+    # Closed at once, also by an interrupt: workers must not outlive the loop.
+    with contextlib.closing(_outcomes(missing, options)) as outcomes:
+        for job, outcome in outcomes:
+            write_done(options.out, job, outcome)
+            done += 1
+            if on_progress is not None:
+                on_progress(done, len(jobs), job.name)
     rows = [_read(row_path(options.out, job)) for job in jobs]
     write_tables(rows, options.out, options.reference or options.methods[0])
     return rows
@@ -200,12 +203,13 @@ def _missing(jobs: Sequence[Job], options: EvaluateOptions) -> list[Job]:
     return sorted([*missing, *changed], key=order.__getitem__)
 
 
-def _outcomes(jobs: Sequence[Job], options: EvaluateOptions) -> Iterator[Outcome]:
+def _outcomes(jobs: Sequence[Job], options: EvaluateOptions) -> Generator[Outcome, None, None]:
     if not jobs:
-        return iter(())
+        return
     if options.engine == "dask":
-        return run_on_dask(jobs, options.settings, options.scheduler)
-    return run_in_processes(jobs, options.settings, options.jobs)
+        yield from run_on_dask(jobs, options.settings, options.scheduler)
+    else:
+        yield from run_in_processes(jobs, options.settings, options.jobs)
 
 
 def _write_settings(options: EvaluateOptions) -> None:

@@ -7,7 +7,10 @@ an exception passes, what is waiting is cancelled.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import multiprocessing
+import os
+import signal
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -18,6 +21,11 @@ from gcar_export.method_settings import MethodSettings
 ENGINES = ("processes", "dask")
 #: seconds to wait for a Dask scheduler to answer.
 CONNECT_S = 20
+#: read by numerical libraries when they are loaded.
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS",
+    "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS",
+)  # fmt: skip
 Outcome = tuple[Job, Done]
 
 
@@ -30,19 +38,51 @@ def run_here(jobs: Sequence[Job], settings: MethodSettings) -> Iterator[Outcome]
 def run_in_processes(
     jobs: Sequence[Job], settings: MethodSettings, processes: int
 ) -> Iterator[Outcome]:
-    """In worker processes of this machine."""
+    """In worker processes of this machine, which share its cores among them.
+
+    An interrupt ends the workers at once: the rows they were at are made again next time.
+    """
     if processes == 1 or len(jobs) < 2:
         yield from run_here(jobs, settings)
         return
+    others = set(multiprocessing.active_children())
     # Spawned, not forked: the runtime and numba keep threads that do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+    threads = max(1, (os.cpu_count() or 1) // processes)
+    with (
+        _few_threads(threads),
+        concurrent.futures.ProcessPoolExecutor(
+            processes, mp_context=context, initializer=_leave_interrupts_to_the_parent
+        ) as pool,
+    ):
         waiting = {pool.submit(run_job, job, settings): job for job in jobs}
         try:
             for future in concurrent.futures.as_completed(waiting):
                 yield waiting[future], future.result()
-        finally:
+        except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            workers = set(multiprocessing.active_children()) - others
+            for worker in workers:
+                worker.terminate()
+            for worker in workers:
+                worker.join()
+            raise
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def _few_threads(threads: int) -> Iterator[None]:
+    """Start child processes with so many threads, unless the user said otherwise."""
+    missing = [name for name in THREAD_VARIABLES if name not in os.environ]
+    os.environ.update(dict.fromkeys(missing, str(threads)))
+    try:
+        yield
+    finally:
+        for name in missing:
+            os.environ.pop(name, None)
 
 
 def run_on_dask(

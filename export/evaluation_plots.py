@@ -106,7 +106,8 @@ def speed_and_error(rows: Rows) -> Figure:
     fig = figure(8.6, 5.2)
     axis = fig.subplots()
     handles = []
-    for entry in sorted(summarise(rows), key=_time_of):
+    timed = [entry for entry in summarise(rows) if entry["cpu_seconds"]["mean"] is not None]
+    for entry in sorted(timed, key=_time_of):
         colour, marker = style(entry["method"])
         seconds, spread = _time_of(entry), entry["cpu_seconds"]["sd"] or 0.0
         (at_half, sd), (best, _) = _figure_of(entry, "dsc"), _figure_of(entry, "best_dsc")
@@ -147,7 +148,7 @@ def all_figures(rows: Rows, reference: str) -> dict[str, Figure]:
 
 def _time_of(entry: Mapping[str, Any]) -> float:
     """Mean CPU seconds; a clock cannot show less than a hundredth on a logarithmic axis."""
-    return max(float(entry["cpu_seconds"]["mean"] or 0.0), 0.01)
+    return max(float(entry["cpu_seconds"]["mean"]), 0.01)
 
 
 def _cases(rows: Rows) -> str:

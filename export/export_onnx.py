@@ -195,6 +195,9 @@ def finish(out: Path, spec: dict[str, Any]) -> dict[str, Any]:
         # Where each node came from in the source is of no use to a host, and outweighs a graph.
         del node.metadata_props[:]
         node.doc_string = ""
+    used = {node.domain for node in model.graph.node}
+    for entry in [e for e in model.opset_import if e.domain not in used]:
+        model.opset_import.remove(entry)
     del model.metadata_props[:]
     for key in ("schema", "name", "kind", "license"):
         entry = model.metadata_props.add()

@@ -178,6 +178,12 @@ def write_case(case: Case, folder: Path) -> list[Path]:
     return paths
 
 
+def case_geometry(protocol: str, views: int) -> tuple[list[CArm], Grid]:
+    """Return views and grid of a set-up, ``paper`` or one of the clinical ones."""
+    carms, _, grid = (_paper_geometry if protocol == "paper" else _clinical_geometry)(views)
+    return carms, grid
+
+
 def _paper_geometry(views: int) -> tuple[list[CArm], list[CArm], Grid]:
     h = PAPER_VOXEL_MM
     grid = Grid(center_mm=(0, 0, 0), size_mm=(128 * h,) * 3, shape=(128, 128, 128))

@@ -68,7 +68,10 @@ def quantize(path: Path, out: Path, calibration: int = 16) -> ModelFile:
     CalibrationDataReader.register(_Calibration)
     with tempfile.TemporaryDirectory(prefix="gcar-int8-") as folder:
         prepared = Path(folder) / "prepared.onnx"
-        quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)
+        # Its optimisation would fuse nodes into operators that only one runtime knows.
+        quant_pre_process(
+            str(path), str(prepared), skip_symbolic_shape=True, skip_optimization=True
+        )
         quiet = logging.getLogger().level
         try:
             quantize_static(

@@ -1,7 +1,5 @@
 """Refinement from true points, with and without noise, on real trees: volume DSC and seconds.
 
-    python -m gcar_export.refine_table --data DIR [--cases 0001,0003] [--protocols paper,clinical]
-
 DIR holds ``imagecas/*.label.nii.gz``. Starting points are the centres of the truth's voxels
 (any occupancy above 0, the occupancy as confidence); with noise each point is moved by its own
 Gaussian offset (standard deviation per axis, in voxels) and 10 % of them are dropped. Volume DSC
@@ -12,9 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import click
 import numpy as np
 
 from gcar_deploy.config import RefineOptions, RunOptions
@@ -25,6 +23,7 @@ from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.refine.refine import refine, refined_volume
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.types import Volume
+from gcar_export.evaluate import case_name, find_labels
 from gcar_export.labels import read_label
 from gcar_export.protocols import make_case
 
@@ -82,40 +81,60 @@ def one_fit(
     return Row(dice(truth, volume), dice(truth, bare), middle - begin, end - middle)
 
 
-@click.command()
-@click.option("--data", type=click.Path(exists=True, path_type=Path), required=True)
-@click.option("--cases", default="", help="comma-separated case names; all where absent")
-@click.option("--protocols", default="paper,clinical", show_default=True)
-@click.option("--noises", default="0,0.5,1,2", show_default=True, help="voxels")
-@click.option("--refiner", default="tube", show_default=True)
-def main(data: Path, cases: str, protocols: str, noises: str, refiner: str) -> None:
-    """Print the table."""
-    levels = [float(x) for x in noises.split(",")]
+#: rows of the table: refiner, and whether the loss has its centreline part
+MODES = (("tube", False), ("tube", True), ("paper", False), ("paper", True))
+
+
+def mode_options(refiner: str, centreline: bool) -> RefineOptions:
+    """Options of one row; the paper's loss is half centreline where it has that part."""
     options = RefineOptions(refiner=refiner)
-    wanted = {name for name in cases.split(",") if name}
-    files = sorted((data / "imagecas").glob("*.label.nii.gz"))
-    files = [f for f in files if not wanted or f.name.split(".")[0] in wanted]
-    for protocol in protocols.split(","):
-        click.echo(
-            f"{protocol}: DSC of volume (bare tubes) and CPU s (fit + volume) per start noise"
-        )
-        click.echo("case   " + "".join(f"{f'{n:g} voxels':>30}" for n in levels))
-        rows: list[list[Row]] = []
-        for file in files:
-            case = make_case(read_label(file), protocol)
-            images = [extract_vessels(a, RunOptions().imaging) for a in case.angiograms()]
-            rows.append([one_fit(case.truth, case.grid, images, n, options) for n in levels])
-            click.echo(f"{file.name.split('.')[0]:7}" + "".join(_cell(r) for r in rows[-1]))
-        means = [
-            Row(*np.mean([dataclasses.astuple(line[k]) for line in rows], axis=0).tolist())
-            for k in range(len(levels))
-        ]
-        click.echo(f"{'mean':7}" + "".join(_cell(r) for r in means))
+    share = 1.0 - options.paper.alpha if centreline else 0.0
+    return dataclasses.replace(
+        options,
+        tube=dataclasses.replace(options.tube, centreline_share=share),
+        paper=dataclasses.replace(options.paper, alpha=1.0 - share),
+    )
 
 
-def _cell(row: Row) -> str:
-    return f"{f'{row.dice:.3f} ({row.tube_dice:.3f}) {row.fit_s:.2f}+{row.volume_s:.2f} s':>30}"
+def refine_rows(
+    data: Path,
+    protocol: str,
+    cases: Sequence[str],
+    noises: Sequence[float],
+    on_fit: Callable[[], None] | None = None,
+) -> dict[tuple[str, bool], list[list[Row]]]:
+    """Fit every case from every start in every mode: mode -> per case, per noise, a row."""
+    found: dict[tuple[str, bool], list[list[Row]]] = {mode: [] for mode in MODES}
+    for path in labels_of(data, cases):
+        case = make_case(read_label(path), protocol)
+        views = [extract_vessels(a, RunOptions().imaging) for a in case.angiograms()]
+        for mode in MODES:
+            rows = []
+            for noise in noises:
+                rows.append(one_fit(case.truth, case.grid, views, noise, mode_options(*mode)))
+                if on_fit is not None:
+                    on_fit()
+            found[mode].append(rows)
+    return found
 
 
-if __name__ == "__main__":
-    main()
+def labels_of(data: Path, cases: Sequence[str]) -> list[Path]:
+    """Label volumes of the wanted cases, all where none are named."""
+    wanted = [p for p in find_labels(data) if not cases or case_name(p) in cases]
+    return wanted
+
+
+def table(found: dict[tuple[str, bool], list[list[Row]]], noises: Sequence[float]) -> str:
+    """Markdown: mean volume DSC and CPU seconds of fit and volume, per mode and start noise."""
+    head = " | ".join(f"{noise:g} voxels" for noise in noises)
+    lines = [
+        f"| refiner | centreline loss | {head} | CPU s |",
+        "|---|---|" + "---|" * len(noises) + "---|",
+    ]
+    for (refiner, centreline), rows in found.items():
+        dice_ = np.array([[row.dice for row in case] for case in rows])
+        seconds = np.mean([[row.fit_s + row.volume_s for row in case] for case in rows])
+        cells = " | ".join(f"{100 * value:.1f}" for value in dice_.mean(axis=0))
+        with_ = "with" if centreline else "without"
+        lines.append(f"| {refiner} | {with_} | {cells} | {seconds:.2f} |")
+    return "\n".join(lines)

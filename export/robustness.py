@@ -11,6 +11,7 @@ angle        deg   the second gantry was turned by so much, half primary, half s
                    the geometry does not say so
 shift        mm    the patient moved by so much along (1, 1, 1) before the second view
 mask         %     so many of the pixels at the vessels' rims are wrong, in patches
+gaps         %     so many of the vessels' pixels are missing, in discs of 2 mm radius
 ============ ===== ========================================================================
 
 All but the first take the clinical views (RAO 30 CAU 20, LAO 45 CRA 25). The volume counts at
@@ -50,8 +51,11 @@ CURVES: dict[str, tuple[float, ...]] = {
     "angle": (0, 1, 2, 3, 4, 5),
     "shift": (0, 2, 4, 6, 8, 10),
     "mask": (0, 10, 20, 30, 40, 50),
+    "gaps": (0, 2, 5, 10, 20),
 }
-UNITS = {"separation": "deg", "angle": "deg", "shift": "mm", "mask": "%"}
+UNITS = {"separation": "deg", "angle": "deg", "shift": "mm", "mask": "%", "gaps": "%"}
+#: radius of a gap, mm at the isocentre
+GAP_MM = 2.0
 FIELDS = ("curve", "level", "case", "status", "dsc", "chamfer_mm", "seconds", "settings")
 _GRID = Grid(center_mm=(0, 0, 0), size_mm=(128, 128, 128), shape=(128, 128, 128))
 
@@ -93,9 +97,12 @@ def examine(tree: LabelVolume, point: Point) -> list[Angiogram]:
     if point.curve == "shift":
         moved, margin = tree.moved(np.full(3, point.level / np.sqrt(3))), point.level
     paths = [raycast(tree, true[0]), raycast(moved, true[1], margin_mm=margin)]
+    rng = np.random.default_rng(zlib.crc32(f"{tree.name} {point.level}".encode()))
     if point.curve == "mask":
-        rng = np.random.default_rng(zlib.crc32(f"{tree.name} {point.level}".encode()))
         paths = [noisy_rim(path, point.level / 100, rng) for path in paths]
+    if point.curve == "gaps":
+        radius = round(GAP_MM / told[0].pixel_at_isocenter_mm)
+        paths = [with_gaps(path, point.level / 100, radius, rng) for path in paths]
     return [_angiogram(str(k + 1), *pair) for k, pair in enumerate(zip(told, paths, strict=True))]
 
 
@@ -114,6 +121,17 @@ def noisy_rim(path_mm: Image, share: float, rng: np.random.Generator) -> Image:
     wrong = rim & (field > np.quantile(field[rim], 1 - share))
     out = np.where(mask > 0, 0.0, cv2.dilate(path_mm, kernel))
     return np.where(wrong, out, path_mm).astype(np.float32)
+
+
+def with_gaps(path_mm: Image, share: float, radius: int, rng: np.random.Generator) -> Image:
+    """Erase discs of so many pixels' radius until a share of the vessel's pixels is gone."""
+    out = path_mm.copy()
+    rows, cols = np.nonzero(path_mm)
+    for k in rng.permutation(len(rows)):
+        if np.count_nonzero(out) <= (1 - share) * len(rows):
+            break
+        cv2.circle(out, (int(cols[k]), int(rows[k])), radius, 0.0, -1)
+    return out
 
 
 def run(

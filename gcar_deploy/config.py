@@ -250,6 +250,8 @@ class TubeOptions:
     anchor_log_radius: float = 0.5
     #: blur of vessel edges that is not the pixel's own (motion, focal spot), box width, mm
     edge_blur_mm: float = 0.5
+    #: share of the pictures' weight that goes to their centreline alone (the paper's 1 - alpha)
+    centreline_share: float = 0.0
     #: a level ends when a step lowers the objective by less than this share
     tolerance: float = 3e-3
     #: a branch or a free end is dropped where less than this share of it is seen in some view

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 
 WIDTH, HEIGHT = 860, 520
-LEFT, RIGHT, TOP, BOTTOM = 70, 220, 46, 62
+LEFT, RIGHT, TOP, BOTTOM = 70, 232, 46, 62
 #: colours that people with colour-blindness tell apart (Okabe and Ito)
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
@@ -63,7 +63,7 @@ def tradeoff_svg(
         out.append(_line(LEFT, sy(t), right, sy(t), "#e4e4e4"))
         out.append(_text(LEFT - 8, sy(t) + 4, _number(t), "end"))
         if bound_mm:
-            out.append(_text(right + 8, sy(t) + 4, f"{t / bound_mm:.2g}", "start"))
+            out.append(_text(right + 8, sy(t) + 4, _number(float(f"{t / bound_mm:.2g}")), "start"))
     out.append(f'<rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}" '
                'fill="none" stroke="#555"/>')  # fmt: skip
     out.append(_text((LEFT + right) / 2, HEIGHT - 20, "seconds per reconstruction, warm", "middle"))
@@ -84,7 +84,7 @@ def tradeoff_svg(
         )
     if knee is not None:
         out += _knee(sx(knee.seconds), sy(knee.error_mm), right)
-    out += _legend(names, colour, right + 74)
+    out += _legend(names, colour, right + 86)
     return "\n".join([*out, "</svg>", ""])
 
 
@@ -92,17 +92,17 @@ def _knee(x: float, y: float, right: float) -> list[str]:
     side, anchor = (14, "start") if x < 0.6 * right else (-14, "end")
     return [
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="10" fill="none" stroke="#000" stroke-width="2"/>',
-        _text(x + side, y + 24, "more work buys nothing past here", anchor),
+        _text(x + side, y - 12, "more work buys nothing past here", anchor),
     ]
 
 
 def _legend(names: Sequence[str], colour: dict[str, str], x: float) -> list[str]:
-    out = []
+    out = [_text(x - 5, TOP + 10, "predictor + refiner", "start")]
     for k, name in enumerate(names):
-        y = TOP + 12 + 22 * k
+        y = TOP + 34 + 22 * k
         out.append(f'<circle cx="{x}" cy="{y - 4}" r="4.5" fill="{colour[name]}"/>')
         out.append(_text(x + 12, y, name, "start"))
-    y = TOP + 18 + 22 * len(names)
+    y = TOP + 40 + 22 * len(names)
     out.append(_line(x - 6, y - 4, x + 8, y - 4, "#444", dash="6 4"))
     out.append(_text(x + 12, y, "Pareto front", "start"))
     return out
@@ -116,12 +116,12 @@ def _log_ticks(low: float, high: float) -> list[float]:
         for e in range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
         for m in (1, 2, 5)
     ]
-    first = max((m for m in marks if m <= low * 0.999), default=marks[0])
-    last = min((m for m in marks if m >= high * 1.001), default=marks[-1])
+    first = max((m for m in marks if m <= low * 0.9), default=marks[0])
+    last = min((m for m in marks if m >= high * 1.1), default=marks[-1])
     return [m for m in marks if first <= m <= last]
 
 
-def _scale(low: float, high: float, start: float, stop: float):  # type: ignore[no-untyped-def]
+def _scale(low: float, high: float, start: float, stop: float) -> Callable[[float], float]:
     span = math.log(high / low) or 1.0
     return lambda v: start + (stop - start) * math.log(max(v, 1e-12) / low) / span
 

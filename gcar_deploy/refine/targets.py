@@ -79,7 +79,7 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
     own = carm.pixel_at_isocenter_mm
     factor = max(int(np.floor(level_mm / own + 1e-6)), 1) if level_mm else 1
     path: Array = np.ascontiguousarray(view.path_mm, dtype=np.float32)
-    weight: Array = view.valid.astype(np.float32)
+    weight: Array = _weight(view, options.centreline_share)
     # Variances in pixels^2 of the working picture; a box of width b has b^2 / 12.
     variance = (options.edge_blur_mm / (own * factor)) ** 2 / 12
     if factor > 1:
@@ -106,3 +106,17 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
         calibrated=view.calibrated,
         empty_cost=float((np.log1p(z * z) * weight[some]).sum()),
     )
+
+
+def _weight(view: VesselImage, centreline_share: float) -> Array:
+    """(rows, cols) float32 weight of each pixel, some of it moved onto the centreline."""
+    weight: Array = view.valid.astype(np.float32)
+    line = view.skeleton & view.valid
+    count = np.count_nonzero(line)
+    if centreline_share <= 0 or not count:
+        return weight
+    # The centreline takes that share of what the whole vessel weighs.
+    vessel = np.count_nonzero(view.mask & view.valid)
+    weight *= np.float32(1.0 - centreline_share)
+    weight[line] += np.float32(centreline_share * vessel / count)
+    return weight

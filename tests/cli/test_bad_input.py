@@ -234,7 +234,22 @@ USAGE = {
     "three pictures for two views": (["run", "V", "W", "V", "--geom", "G", "--out", "O"], 4),
     "missing model": (["run", "V", "W", "--geom", "G", "--out", "O", "--model", "m.onnx"], 5),
     "a picture for a model": (["run", "V", "W", "--geom", "G", "--out", "O", "--model", "V"], 5),
-    "no single model": (["run", "V", "W", "--geom", "G", "--out", "O", "--predictor", "single"], 5),
+    "no such single model": (
+        [
+            "run",
+            "V",
+            "W",
+            "--geom",
+            "G",
+            "--out",
+            "O",
+            "--predictor",
+            "single",
+            "--model",
+            "m.onnx",
+        ],
+        5,
+    ),
     "deadline too short": (["run", "V", "W", "--geom", "G", "--out", "O", "--deadline", "1e-6"], 7),
     "strict": (
         ["run", "V", "W", "--geom", "G", "--out", "O", "--strict", "--predictor", "none"],

@@ -12,6 +12,7 @@ from importlib import resources
 import pytest
 
 from gcar_deploy.cli.main import VERBS
+from gcar_deploy.predict.model_spec import SHIPPED, shipped_model_path
 from tests.cli.conftest import gcar
 
 
@@ -171,3 +172,30 @@ def test_the_progress_bar_is_for_terminals_only(monkeypatch, capsys):
     with common.ProgressBar(quiet=True) as bar:
         bar("refine", 0.5)
     assert "refine" not in capsys.readouterr().err
+
+
+def test_run_with_the_single_view_predictor_says_so(good_case, tmp_path):
+    out = tmp_path / "single"
+    pictures = [good_case / f"view{k}.png" for k in (1, 2)]
+    done = gcar("run", *pictures, "--geom", good_case / "geom.json", "--out", out,
+                "--predictor", "single")  # fmt: skip
+    assert done.code == 0, done.err
+    summary = json.loads((out / "result.json").read_text())
+    assert summary["predictor"] == "single" and summary["model"]["name"] == "gcp-single"
+
+
+@pytest.mark.parametrize("kind", ["multi", "single"])
+def test_info_prints_the_card_of_a_model(kind, tmp_path):
+    path = shipped_model_path(SHIPPED[kind])
+    done = gcar("info", path)
+    assert done.code == 0 and f"gcp-{kind}: {kind}-view Gaussian centre predictor" in done.out
+    spec = json.loads(path.with_suffix(".json").read_text())
+    assert spec["sha256"] in done.out and f"{spec['parameters']:,} parameters" in done.out
+    assert "trained on: generated trees alone" in done.out.replace("trees only", "trees alone")
+    assert json.loads(gcar("info", path, "--json").out) == spec
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "m.onnx").write_bytes(bytes(data))
+    (tmp_path / "m.json").write_text(json.dumps(spec))
+    altered = gcar("info", tmp_path / "m.onnx")
+    assert altered.code == 5 and "was altered" in altered.err

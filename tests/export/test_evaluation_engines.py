@@ -1,5 +1,7 @@
 """The same rows wherever they are made: here, in processes, on a Dask cluster."""
 
+import multiprocessing
+import os
 import sys
 
 import pytest
@@ -33,6 +35,23 @@ def here(given, tmp_path_factory):
 def test_processes_make_the_same_rows(given, here, tmp_path):
     rows = evaluate(EvaluateOptions(**given, out=tmp_path, jobs=2))
     assert measures(rows) == here
+
+
+@pytest.mark.slow
+def test_an_interrupt_ends_the_workers_and_keeps_what_is_done(given, here, tmp_path):
+    def stop(done, total, text):
+        raise KeyboardInterrupt
+
+    options = EvaluateOptions(**given, out=tmp_path, jobs=2)
+    threads = {name: os.environ.get(name) for name in evaluation_engines.THREAD_VARIABLES}
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(options, stop)
+    assert threads == {n: os.environ.get(n) for n in evaluation_engines.THREAD_VARIABLES}
+    assert not multiprocessing.active_children()
+    assert len(list(tmp_path.glob("rows/*"))) == 1
+    calls = []
+    assert measures(evaluate(options, lambda *call: calls.append(call))) == here
+    assert calls[0][2] == "1 rows kept"
 
 
 @pytest.mark.slow

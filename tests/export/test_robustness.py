@@ -9,7 +9,7 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import separation_deg
 from gcar_export import robustness
 from gcar_export.labels import from_array
-from gcar_export.robustness import CURVES, Point, examine, noisy_rim, points, run, table
+from gcar_export.robustness import CURVES, Point, examine, noisy_rim, points, run, table, with_gaps
 from tests.conftest import data_dir
 
 
@@ -26,7 +26,7 @@ def test_separation_is_the_angle_between_the_views(tree, level):
     assert separation_deg(first.carm, second.carm) == pytest.approx(level)
 
 
-@pytest.mark.parametrize("curve", ["angle", "shift", "mask"])
+@pytest.mark.parametrize("curve", ["angle", "shift", "mask", "gaps"])
 def test_level_nought_is_exact_and_more_changes_what_it_says(tree, curve):
     exact, changed = (examine(tree, Point(curve, level)) for level in (0, CURVES[curve][-1]))
     reference = examine(tree, Point("angle", 0))
@@ -35,7 +35,7 @@ def test_level_nought_is_exact_and_more_changes_what_it_says(tree, curve):
     # The geometry never tells, and an error of the geometry is one of the second view alone.
     assert [a.carm for a in changed] == [a.carm for a in exact]
     same = [np.array_equal(a.pixels, b.pixels) for a, b in zip(exact, changed, strict=True)]
-    assert same == ([False, False] if curve == "mask" else [True, False])
+    assert same == ([False, False] if curve in ("mask", "gaps") else [True, False])
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
@@ -52,8 +52,16 @@ def test_noise_touches_so_many_rim_pixels_and_nothing_else(tree, share):
     np.testing.assert_array_equal(noisy[~rim], path[~rim])
 
 
+def test_gaps_take_so_many_pixels_and_change_no_other(tree):
+    path = examine(tree, Point("gaps", 0))[0].pixels
+    holes = with_gaps(path, 0.1, 4, np.random.default_rng(0))
+    gone = (path > 0) & (holes == 0)
+    assert gone.sum() / (path > 0).sum() == pytest.approx(0.1, abs=0.03)
+    np.testing.assert_array_equal(holes[~gone], path[~gone])
+
+
 def test_unknown_curves_are_named():
-    with pytest.raises(UsageError, match="'heat' is none of separation, angle, shift, mask"):
+    with pytest.raises(UsageError, match="'heat' is none of separation, angle, shift, mask, gaps"):
         list(points(["heat"]))
 
 

@@ -182,6 +182,22 @@ def test_pictures_without_a_geometry_are_told_so(serving):
     assert "geometry is needed" in job["error"]["message"]
 
 
+def test_dicom_runs_bring_their_own_geometry(serving):
+    """Uploads are told apart by their content and suffix; tiny ones may honestly be refused."""
+    pytest.importorskip("pydicom")
+    from tests.dicom.files import as_bytes, classic
+
+    ask, _ = serving
+    files = [
+        ("view", f"IM{k}.dcm", as_bytes(classic(PositionerPrimaryAngle=str(angle))))
+        for k, angle in enumerate((-30, 45))
+    ]
+    body, kind = multipart(files)
+    job = ask("POST", "/v1/reconstruct?wait=60", body, Content_Type=kind).json()
+    assert job["state"] in ("done", "refused"), job
+    assert job["error"] is None or job["error"]["exit_code"] == 6
+
+
 def test_bad_bodies(serving):
     ask, folder = serving
     post = lambda body, kind: ask("POST", "/v1/reconstruct", body, Content_Type=kind)  # noqa: E731

@@ -1,0 +1,77 @@
+"""Tables of the refinement: modes, calibration of sigma, cost curves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba")
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.refine.targets import make_targets
+from gcar_deploy.selftest import tiny_case, tiny_tree
+from gcar_deploy.tree.occupancy import tree_occupancy
+from gcar_deploy.tree.tree import Tree
+from gcar_export import refine_table as refining
+from gcar_export import sigma_table as sigma
+from gcar_export.cost_curves import Curve
+from gcar_export.trees import SyntheticTree, Vessel
+
+
+def test_exponent_of_a_power_law():
+    sizes = (100, 300, 1000)
+    curve = Curve("x", sizes, tuple(2e-4 * n**1.5 for n in sizes))
+    assert curve.exponent == pytest.approx(1.5)
+
+
+def test_modes_differ_in_the_centreline_alone():
+    plain = refining.mode_options("paper", False)
+    assert plain.paper.alpha == 1.0 and refining.mode_options("paper", True).paper.alpha == 0.5
+    assert refining.mode_options("tube", False).tube.centreline_share == 0.0
+    angiograms, _, _ = tiny_case()
+    views = [extract_vessels(a, RunOptions().imaging) for a in angiograms]
+    tube = refining.mode_options("tube", True).tube
+    line, without = (
+        make_targets(views, 0.0, o)[0] for o in (tube, refining.mode_options("tube", False).tube)
+    )
+    skeleton, mask = views[0].skeleton, views[0].mask
+    assert (line.weight[skeleton] > 1).all() and (line.weight[~skeleton] == 0.5).all()
+    assert line.weight[mask].sum() == pytest.approx(without.weight[mask].sum(), rel=0.01)
+
+
+@pytest.mark.slow
+def test_true_points_give_the_tree_back_and_noise_costs():
+    angiograms, grid, tree = tiny_case()
+    views = [extract_vessels(a, RunOptions().imaging) for a in angiograms]
+    truth = tree_occupancy(tree, grid)
+    rows = [
+        refining.one_fit(truth, grid, views, noise, refining.mode_options("tube", False))
+        for noise in (0.0, 2.0)
+    ]
+    assert rows[0].dice > 0.95 > rows[1].dice > 0.6
+    text = refining.table({("tube", False): [rows]}, (0.0, 2.0))
+    assert f"| tube | without | {100 * rows[0].dice:.1f} | {100 * rows[1].dice:.1f} |" in text
+
+
+def test_errors_are_measured_from_the_true_centreline():
+    made = tiny_tree()
+    vessels = tuple(Vessel("v", "left", b.points_mm, b.radius_mm) for b in made.branches)
+    truth = SyntheticTree(vessels, "right")
+    shifted = Tree(
+        nodes_mm=made.nodes_mm,
+        branches=tuple(
+            dataclasses.replace(b, sigma_mm=np.full(len(b), 0.5)) for b in made.branches
+        ),
+    )
+    error, said = sigma.point_errors(shifted, truth)
+    assert error.max() < 0.06 and (said == 0.5).all()
+
+
+@pytest.mark.slow
+def test_calibration_counts_trees_and_points():
+    row = sigma.calibrate("clinical", "clean", "none", seed=3, trees=1)
+    assert row.trees == 1 and (row.refused == 1 or row.points > 50)
+    if not row.refused:
+        assert row.mean_z2 > 0 and 0 <= row.coverage <= 1 and row.rmse_mm < sigma.GHOST_MM
+        assert f"| {row.mean_z2:.2f} |" in sigma.table([row])
