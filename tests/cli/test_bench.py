@@ -40,7 +40,12 @@ def test_table_and_picture_hold_every_cell():
     tips = [t.text for t in svg.iter(f"{space}title")]
     assert len(tips) == 3 and any("paper & co" in t for t in tips)
     words = " ".join(t.text for t in svg.iter(f"{space}text"))
-    assert "Pareto front" in words and "Bound" in words.title() and "more work" in words and "predictor + refiner" in words
+    assert (
+        "Pareto front" in words
+        and "Bound" in words.title()
+        and "more work" in words
+        and "predictor + refiner" in words
+    )
 
 
 def test_the_grid_varies_every_axis():
