@@ -10,7 +10,7 @@ import click
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli_centers import centers_table, robustness
-from gcar_export.cli_evaluate import converge, evaluate
+from gcar_export.cli_evaluate import converge, evaluate, words
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -223,19 +223,17 @@ def refine_table(data: Path, cases: str, protocols: str, noises: str) -> None:
     from gcar_export import refine_table as refining
 
     try:
-        levels = [float(word) for word in _words(noises)]
+        levels = [float(word) for word in words(noises)]
     except ValueError:
         raise UsageError(f"--noises {noises!r} is not a comma-separated list of numbers") from None
-    count = len(refining.labels_of(data, _words(cases)))
+    count = len(refining.labels_of(data, words(cases)))
     if not count:
         raise UsageError(f"--cases {cases}: none of them is in {data}")
-    total = count * len(levels) * len(refining.MODES) * len(_words(protocols))
+    total = count * len(levels) * len(refining.MODES) * len(words(protocols))
     tables = []
     with click.progressbar(length=total, label="fits", file=sys.stderr) as bar:
-        for protocol in _words(protocols):
-            rows = refining.refine_rows(
-                data, protocol, _words(cases), levels, lambda: bar.update(1)
-            )
+        for protocol in words(protocols):
+            rows = refining.refine_rows(data, protocol, words(cases), levels, lambda: bar.update(1))
             tables.append(f"{protocol}, volume DSC at 0.5 in %\n\n{refining.table(rows, levels)}")
     click.echo("\n\n".join(tables))
 
@@ -268,9 +266,9 @@ def sigma_table(seed: int, trees: int, protocols: str, predictors: str) -> None:
 
     cells = [
         (protocol, condition, predictor)
-        for protocol in _words(protocols)
+        for protocol in words(protocols)
         for condition in sigma.CONDITIONS
-        for predictor in _words(predictors)
+        for predictor in words(predictors)
     ]
     rows = []
     with click.progressbar(length=len(cells) * trees, label="trees", file=sys.stderr) as bar:

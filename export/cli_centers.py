@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from gcar_export.cli_evaluate import words
+
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _CASES = click.option("--cases", default="", help="Only these cases, comma-separated.")
 
@@ -33,9 +35,9 @@ def centers_table(data: Path, protocol: str, models: str, cases: str, no_cost: b
     """
     from gcar_export import centers_table as centers
 
-    opened = centers.open_models(_words(models))
-    rows = centers.measure(data, protocol, opened, _words(cases), _progress)
-    costs = [] if no_cost else centers.cost(data, protocol, opened, _words(cases))
+    opened = centers.open_models(words(models))
+    rows = centers.measure(data, protocol, opened, words(cases), _progress)
+    costs = [] if no_cost else centers.cost(data, protocol, opened, words(cases))
     click.echo(centers.table(rows, costs, protocol))
 
 
@@ -62,13 +64,9 @@ def robustness(data: Path, cases: str, curves: str, model: Path | None, out: Pat
     from gcar_export import robustness as curves_of
 
     rows = curves_of.run(
-        data, out, cases=_words(cases), curves=_words(curves), model=model, progress=_progress
+        data, out, cases=words(cases), curves=words(curves), model=model, progress=_progress
     )
     click.echo(curves_of.table(rows))
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
 def _progress(done: int, total: int, text: str) -> None:

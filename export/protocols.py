@@ -180,7 +180,7 @@ def write_case(case: Case, folder: Path) -> list[Path]:
 
 def case_geometry(protocol: str, views: int) -> tuple[list[CArm], Grid]:
     """Return views and grid of a set-up, ``paper`` or one of the clinical ones."""
-    carms, _, grid = (_paper_geometry if protocol == "paper" else _clinical_geometry)(views)
+    carms, _, grid = (_paper_geometry if protocol == "paper" else clinical_geometry)(views)
     return carms, grid
 
 
