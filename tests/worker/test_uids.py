@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 pytest.importorskip("pynetdicom", reason="needs the listen extra")
-from gcar_deploy.worker.listen import _UID  # noqa: E402
+from gcar_deploy.worker.listen import _UID
 
 
 @pytest.mark.parametrize("uid", ["1.2.840.10008.1", "2.25.0", "1" * 64])
