@@ -18,12 +18,16 @@ import cv2
 import numpy as np
 
 from gcar_deploy.config import ImagingOptions
+from gcar_deploy.engine import load_segmenter
+from gcar_deploy.errors import ModelError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import DEFAULT_FIELD_MM, Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.net import INPUT, Segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.skeleton import skeletonize
+from gcar_deploy.predict.model_spec import read_model
 from gcar_deploy.types import Image, Mask
 
 #: truth of the R_ cases: rays that cross at least this much vessel
@@ -35,12 +39,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--each", action="store_true", help="one line per expert-masked picture")
+    parser.add_argument("--segmenter", choices=("classic", "net"), default="classic")
+    parser.add_argument("--model", type=Path, help="ONNX file for net; by default the shipped one")
     chosen = parser.parse_args(arguments)
+    net = None if chosen.segmenter == "classic" else network(chosen.model)
     cv2.setNumThreads(1)
     pairs = sorted(find(chosen.data, "xca_masks").glob("*_gt.png"))
     if pairs:
-        _print_expert(pairs, chosen.each)
-    _print_cases(find(chosen.data, "cases"))
+        _print_expert(pairs, chosen.each, net)
+    _print_cases(find(chosen.data, "cases"), net)
     return 0
 
 
@@ -49,17 +56,33 @@ def find(data: Path, name: str) -> Path:
     return data / name if (data / name).is_dir() else data / "data" / name
 
 
-def expert_score(truth_path: Path) -> tuple[dict[str, float], VesselImage]:
-    """Score one expert-masked picture."""
+def network(path: Path | None) -> Segmenter:
+    """Load the segmentation network from a file, or the one that comes along."""
+    if path is not None:
+        return Segmenter(read_model(path, wanted=INPUT).data, path.stem, threads=1)
+    found = load_segmenter("net", 1)
+    if found is None:
+        raise ModelError("no segmentation network is installed")
+    return found
+
+
+def expert_score(
+    truth_path: Path, net: Segmenter | None = None
+) -> tuple[dict[str, float], VesselImage]:
+    """Score one expert-masked picture; ``net`` finds the vessels if given."""
     truth = read_picture(truth_path)[0] > 127
     picture = truth_path.with_name(truth_path.name.replace("_gt", ""))
     angiogram = Angiogram.without_geometry(
         picture.stem, read_picture(picture), Intensity(kind="raw")
     )
     start = time.process_time()
-    found = extract_vessels(angiogram, ImagingOptions())
+    found = extract_vessels(angiogram, _options(net), net)
     seconds = time.process_time() - start
     return {**mask_scores(found.mask, found.skeleton, truth), "CPU s": seconds}, found
+
+
+def _options(net: Segmenter | None) -> ImagingOptions:
+    return ImagingOptions(segmenter="classic" if net is None else "net")
 
 
 def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
@@ -76,7 +99,9 @@ def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
     }
 
 
-def case_scores(cases: Path) -> Iterator[tuple[str, dict[str, float], VesselImage, Image]]:
+def case_scores(
+    cases: Path, net: Segmenter | None = None
+) -> Iterator[tuple[str, dict[str, float], VesselImage, Image]]:
     """Score each view of each ``R_*`` case against the path lengths of its ``C_*`` case."""
     for raw in sorted(cases.glob("R_*")):
         clean = raw.with_name("C_" + raw.name[2:])
@@ -93,7 +118,7 @@ def case_scores(cases: Path) -> Iterator[tuple[str, dict[str, float], VesselImag
                 intensity=intensity, sha256=sha256,
             )  # fmt: skip
             start = time.process_time()
-            found = extract_vessels(angiogram, ImagingOptions())
+            found = extract_vessels(angiogram, _options(net), net)
             seconds = time.process_time() - start
             scores = mask_scores(found.mask, found.skeleton, truth >= TRUTH_MM)
             scores |= path_scores(found.path_mm, truth) | {"CPU s": seconds}
@@ -111,8 +136,8 @@ def path_scores(path_mm: Image, truth_mm: Image) -> dict[str, float]:
     }
 
 
-def _print_expert(pairs: Sequence[Path], each: bool) -> None:
-    rows = {path.name.replace("_gt.png", ""): expert_score(path)[0] for path in pairs}
+def _print_expert(pairs: Sequence[Path], each: bool, net: Segmenter | None) -> None:
+    rows = {path.name.replace("_gt.png", ""): expert_score(path, net)[0] for path in pairs}
     names = list(next(iter(rows.values())))
     print(
         f"Expert masks, {len(rows)} pictures (no geometry: field taken as {DEFAULT_FIELD_MM:g} mm)"
@@ -126,9 +151,9 @@ def _print_expert(pairs: Sequence[Path], each: bool) -> None:
         print(_line(label, {n: float(reduce([r[n] for r in rows.values()])) for n in names}))
 
 
-def _print_cases(cases: Path) -> None:
+def _print_cases(cases: Path, net: Segmenter | None) -> None:
     heading = True
-    for name, scores, _, _ in case_scores(cases):
+    for name, scores, _, _ in case_scores(cases, net):
         if heading:
             print(f"\nRaw pictures of simulated views (truth: path >= {TRUTH_MM} mm)")
             print("| view | " + " | ".join(scores) + " |")
