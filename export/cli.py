@@ -10,7 +10,8 @@ import click
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli_centers import centers_table, robustness
-from gcar_export.cli_evaluate import converge, evaluate, words
+from gcar_export.cli_evaluate import converge, evaluate
+from gcar_export.cli_refine import cost_curves, refine_table, sigma_table
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -210,75 +211,6 @@ def golden(model: Path, force: bool) -> None:
     click.echo(f"{path}: {path.stat().st_size} bytes")
 
 
-@main.command("refine-table")
-@click.option("--data", type=_FOLDER, required=True, help="Folder with label volumes.")
-@click.option("--cases", default="", help="Only these cases, comma-separated.")
-@click.option("--protocols", default="paper,clinical", show_default=True)
-@click.option("--noises", default="0,0.5,1,2", show_default=True, help="Start noise, voxels.")
-def refine_table(data: Path, cases: str, protocols: str, noises: str) -> None:
-    """Refine from the same true and noisy points in both modes, with and without centreline loss.
-
-    Example: gcar-export refine-table --data data --cases 0001,0134,0595
-    """
-    from gcar_export import refine_table as refining
-
-    try:
-        levels = [float(word) for word in words(noises)]
-    except ValueError:
-        raise UsageError(f"--noises {noises!r} is not a comma-separated list of numbers") from None
-    count = len(refining.labels_of(data, words(cases)))
-    if not count:
-        raise UsageError(f"--cases {cases}: none of them is in {data}")
-    total = count * len(levels) * len(refining.MODES) * len(words(protocols))
-    tables = []
-    with click.progressbar(length=total, label="fits", file=sys.stderr) as bar:
-        for protocol in words(protocols):
-            rows = refining.refine_rows(data, protocol, words(cases), levels, lambda: bar.update(1))
-            tables.append(f"{protocol}, volume DSC at 0.5 in %\n\n{refining.table(rows, levels)}")
-    click.echo("\n\n".join(tables))
-
-
-@main.command("cost-curves")
-def cost_curves() -> None:
-    """Time refinement against Gaussians, views and pixels, and print the exponents.
-
-    Example: gcar-export cost-curves
-    """
-    from gcar_export import cost_curves as cost
-
-    total = len(cost.GAUSSIANS) + len(cost.VIEWS) + len(cost.PIXELS)
-    with click.progressbar(length=total, label="sizes", file=sys.stderr) as bar:
-        found = cost.curves(lambda: bar.update(1))
-    click.echo(cost.table(found))
-
-
-@main.command("sigma-table")
-@click.option("--seed", default=1, show_default=True, help="Population of generated trees.")
-@click.option("--trees", default=10, show_default=True, help="Trees per row.")
-@click.option("--protocols", default="paper,clinical", show_default=True)
-@click.option("--predictors", default="multi,none", show_default=True)
-def sigma_table(seed: int, trees: int, protocols: str, predictors: str) -> None:
-    """Compare the stated sigma with true errors on generated trees.
-
-    Example: gcar-export sigma-table --seed 2 --trees 20
-    """
-    from gcar_export import sigma_table as sigma
-
-    cells = [
-        (protocol, condition, predictor)
-        for protocol in words(protocols)
-        for condition in sigma.CONDITIONS
-        for predictor in words(predictors)
-    ]
-    rows = []
-    with click.progressbar(length=len(cells) * trees, label="trees", file=sys.stderr) as bar:
-        for cell in cells:
-            rows.append(
-                sigma.calibrate(*cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1))
-            )
-    click.echo(sigma.table(rows))
-
-
 @main.command("tree-table")
 @click.option(
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
@@ -317,7 +249,15 @@ def lumen_table(data: Path | None, count: int) -> None:
 
 
 # Verbs with files of their own.
-for _verb in (evaluate, converge, centers_table, robustness):
+for _verb in (
+    evaluate,
+    converge,
+    centers_table,
+    robustness,
+    refine_table,
+    cost_curves,
+    sigma_table,
+):
     main.add_command(_verb)
 
 

@@ -75,7 +75,8 @@ def bars_over_views(rows: Rows, reference: str) -> Figure:
             colour, marker = style(method)
             entries = [means.get((method, n)) for n in views]
             at = np.arange(len(views)) + 0.8 * ((k + 0.5) / len(methods) - 0.5)
-            _bars(axis, at, entries, bar, colour, 0.75 / len(methods), method)
+            label = method + _fewer(rows, method)
+            _bars(axis, at, entries, bar, colour, 0.75 / len(methods), label)
             _stars(axis, at, entries, bar, [stars.get((method, n, bar), "") for n in views])
             shown = [_figure_of(e, line)[0] for e in entries]
             other.plot(
@@ -117,7 +118,8 @@ def speed_and_error(rows: Rows) -> Figure:
             seconds, at_half, yerr=sd, xerr=[[min(spread, 0.6 * seconds)], [spread]],
             fmt=marker, color=colour, ms=8, mec="black", mew=0.6, capsize=2, lw=0.8,
         )  # fmt: skip
-        label = f"{entry['method']}: {seconds:.2g} s" + (
+        method = entry["method"] + _fewer(rows, entry["method"])
+        label = f"{method}: {seconds:.2g} s" + (
             "" if np.isfinite(at_half) else ", no voxel reaches 0.5"
         )
         handles += axis.plot([], [], marker, color=colour, mec="black", mew=0.6, label=label)
@@ -154,6 +156,13 @@ def _time_of(entry: Mapping[str, Any]) -> float:
 def _cases(rows: Rows) -> str:
     count = len({row["case"] for row in rows})
     return "1 case" if count == 1 else f"{count} cases"
+
+
+def _fewer(rows: Rows, method: str) -> str:
+    """How many cases a method has, where not all."""
+    cases = {row["case"] for row in rows}
+    own = {row["case"] for row in rows if row["method"] == method}
+    return "" if own == cases else f" (n={len(own)})"
 
 
 def _bars(

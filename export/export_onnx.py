@@ -23,7 +23,7 @@ from gcar_deploy.predict.encoding import (
     input_names,
 )
 from gcar_export.checkpoint import filled, read_manifest, read_tensors
-from gcar_export.dataset import training_scene
+from gcar_export.dataset import USUAL_SPREAD_DEG, USUAL_VIEWS, training_scene
 from gcar_export.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.networks.unet import UNetConfig, UNetPredictor
 
@@ -161,6 +161,7 @@ def _spec(net: torch.nn.Module, manifest: dict[str, Any], name: str) -> dict[str
             "geometry": "2 views or more, 25 .. 155 deg apart",
         }
     config = net.config
+    usual = ", ".join(_view_name(a, b) for a, b in USUAL_VIEWS)
     return spec | {
         "kind": "single",
         "inputs": {
@@ -173,9 +174,15 @@ def _spec(net: torch.nn.Module, manifest: dict[str, Any], name: str) -> dict[str
         },
         "outputs": ["depth 0 .. 1 along the true ray", "offset_pixels u v w"],
         "spacing_mm": [0.8, 1.6],
-        "geometry": "paper: SOD 1000 pixels, secondary 0; clinical: SOD 700 .. 820 mm, "
-        "primary within 60 deg, secondary within 35 deg",
+        "geometry": f"the paper's two views; {usual}, give or take {USUAL_SPREAD_DEG:g} deg, "
+        "SOD 700 .. 820 mm",
     }
+
+
+def _view_name(primary: float, secondary: float) -> str:
+    """Name a direction as it is said in the room."""
+    first = "AP" if not primary else f"{'LAO' if primary > 0 else 'RAO'} {abs(primary)}"
+    return f"{first} {'CRA' if secondary > 0 else 'CAU'} {abs(secondary)}"
 
 
 def finish(out: Path, spec: dict[str, Any]) -> dict[str, Any]:

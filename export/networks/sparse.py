@@ -88,7 +88,11 @@ class GatherConv(nn.Module):
     def forward(self, x: torch.Tensor, neighbours: torch.Tensor) -> torch.Tensor:
         """(n, c_in) and (n, 27) to (n, c_out)."""
         if self.training:
-            return _GatherMatmul.apply(x, self.linear.weight, neighbours) + self.linear.bias
+            weight = self.linear.weight
+            if torch.is_autocast_enabled(x.device.type):
+                kind = torch.get_autocast_dtype(x.device.type)
+                x, weight = x.to(kind), weight.to(kind)
+            return _GatherMatmul.apply(x, weight, neighbours) + self.linear.bias
         padded = torch.cat([x, x.new_zeros(1, x.shape[1])])
         gathered = padded.index_select(0, neighbours.reshape(-1)).reshape(-1, 27 * x.shape[1])
         return self.linear(gathered)
@@ -155,7 +159,8 @@ class RayExchange(nn.Module):
         return x + self.out(torch.cat([message.mean(0), message.amax(0)], dim=1))
 
     def _scattered(self, z, contribution, flat, rays):
-        """Mean, maximum and account per ray by scatter: for training."""
+        """Mean, maximum and account per ray by scatter: for training, sums in single precision."""
+        z = z.to(torch.promote_types(z.dtype, torch.float32))
         ones = torch.ones_like(contribution)
         summed = torch.cat([z[:, : self.c_ray], ones, contribution], dim=1)
         total = z.new_zeros(rays, self.c_ray + 2).index_add(0, flat, summed)
@@ -229,6 +234,7 @@ class Level(nn.Module):
 
 
 def _pool(x: torch.Tensor, parent: torch.Tensor, n: int) -> torch.Tensor:
+    x = x.to(torch.promote_types(x.dtype, torch.float32))
     ones = torch.ones(x.shape[0], 1, dtype=x.dtype, device=x.device)
     total = x.new_zeros(n, x.shape[1] + 1).index_add(0, parent, torch.cat([x, ones], dim=1))
     return total[:, :-1] / total[:, -1:].clamp(min=1)

@@ -28,6 +28,10 @@ from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
+#: error of a tube between the pixels, as a share of the coarsest pixel at the isocentre. Chosen
+#: on generated trees (``gcar-export sigma-table --seed 1``), to be judged on another seed
+PIXEL_SHARE = 0.45
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class TubeFit:
@@ -207,14 +211,15 @@ def tree_of(tubes: Tubes, tree: Tree) -> Tree:
 
 
 def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
-    """Return the tree with sigma per point: fit and geometry prior, in quadrature."""
+    """Return the tree with sigma per point: fit, geometry prior and pixel, in quadrature."""
     tree, tubes = now.tree, now.tubes
     hessian, _ = normal_equations(tubes, targets, now.prints, now.prior, options)
     tangents = np.zeros_like(tubes.positions_mm)
     tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
     own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]
     geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets], options)
-    sigma = np.sqrt(own**2 + geometry**2)
+    pixel = max(target.pixel_mm for target in targets)
+    sigma = np.sqrt(own**2 + geometry**2 + (PIXEL_SHARE * pixel) ** 2)
     branches = [
         dataclasses.replace(branch, sigma_mm=sigma[tubes.point_branch == k])
         for k, branch in enumerate(tree.branches)

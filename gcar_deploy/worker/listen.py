@@ -28,7 +28,7 @@ LOOPBACK = "127.0.0.1"
 _VERIFICATION = "1.2.840.10008.1.1"
 #: C-STORE answers (PS3.4 B.2.3)
 SUCCESS, OUT_OF_RESOURCES, NOT_A_RUN = 0x0000, 0xA700, 0xA900
-_UID = re.compile(r"[0-9.]{1,64}")
+_UID = re.compile(r"(?=.{1,64}\Z)[0-9]+(?:\.[0-9]+)*")
 #: senders at a time, and studies that may wait for more runs
 MOST_SENDERS, MOST_STUDIES = 4, 64
 _SECONDS = 60

@@ -22,7 +22,10 @@ def case(index, folder):
     if index == 5: raise FoundError("left behind")
     if index == 6: time.sleep(600)
     return "fine"
-tally = run_cases(case, 0, 9, Limits(cpu_s=0.5, wall_s=5.0))
+tally = run_cases(case, 0, 6, Limits(cpu_s=0.5))
+# A case that only sleeps is alone in its child: no busy machine can make it end in time.
+tally.add(run_cases(case, 6, 1, Limits(wall_s=2.0)))
+tally.add(run_cases(case, 7, 2, Limits(cpu_s=0.5)))
 for line in tally.findings: print(line)
 print(tally.cases, tally.outcomes["fine"])
 """

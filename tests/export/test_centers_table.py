@@ -47,13 +47,13 @@ def test_no_centre_is_no_precision_and_no_recall(tube):
 def test_table_has_a_row_per_predictor_and_its_cost():
     rows = [Row("a", "single", 0.5, 0.25, 90), Row("b", "single", 0.7, 0.75, 110),
             Row("a", "multi", 1.0, 1.0, 100)]  # fmt: skip
-    text = table(rows, [Cost("multi", 1.5, 0.3, 0.2, 230.4)], "paper")
+    text = table(rows, [Cost("multi", 1.5, 1.25, 0.3, 0.2, 230.4)], "paper")
     assert "| multi (n=1) | 100.0 ± 0.0 | 100.0 ± 0.0 |" in text
     assert (
         "| single (n=2) | 60.0 ± 14.1 | 50.0 ± 35.4 | 50.0 .. 70.0 / 25.0 .. 75.0 | 100 |" in text
     )
     assert text.index("| multi (n=1)") < text.index("| single (n=2)")
-    assert "| multi | 1.50 | 0.300 | 0.200 | 230 |" in text
+    assert "| multi | 1.50 | 1.25 | 0.300 | 0.200 | 230 |" in text
 
 
 def test_models_by_kind_or_path(monkeypatch, tmp_path):

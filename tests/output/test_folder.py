@@ -149,7 +149,9 @@ def test_a_folder_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
 def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
     out = tmp_path / "out"
     script = (
-        "import sys, time\n"
+        "import signal, sys, time\n"
+        # A test run in the background hands down that interrupts are ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from gcar_deploy.cli import main as cli\n"
         "from gcar_deploy.output import folder\n"
         "from gcar_deploy.cli.main import main\n"
@@ -168,7 +170,7 @@ def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
         assert process.stdout.readline().strip() == "writing"
         time.sleep(0.1)
         process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=300)
     assert process.returncode == code
     assert errors.strip().splitlines()[-1].startswith("gcar: error:")
     assert "Traceback" not in errors
