@@ -157,14 +157,15 @@ def markdown(rows: Sequence[Mapping[str, Any]], reference: str | None = None) ->
     out = []
     columns = {**MEASURES, **COUNTS}
     for (protocol, views), group in grouped(summarise(rows), ("protocol", "views")).items():
-        out.append(f"### {protocol} protocol, {views} views, {group[0]['cases']} cases\n")
+        cases = max(entry["cases"] for entry in group)
+        out.append(f"### {protocol} protocol, {views} views, {cases} cases\n")
         out.append("| " + " | ".join(["method", *(c.heading for c in columns.values())]) + " |")
         out.append("|---" * (1 + len(columns)) + "|")
         for entry in group:
             cells = [entry["method"]]
             for name, column in columns.items():
                 stars = tests.get((protocol, views, entry["method"], name), "")
-                cells.append(mean_sd(entry[name], column, entry["cases"]) + stars)
+                cells.append(mean_sd(entry[name], column, cases) + stars)
             out.append("| " + " | ".join(cells) + " |")
         out.append("")
     out.append("Mean ± SD. (n=k) where a measure is defined for fewer cases than the table has.")

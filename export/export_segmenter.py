@@ -14,8 +14,9 @@ from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging.net import INPUT, STRIDE, Segmenter
 from gcar_export.angiograms import training_pair
-from gcar_export.export_onnx import IR_VERSION, OPSET, PARITY
+from gcar_export.export_onnx import IR_VERSION, OPSET
 from gcar_export.networks.mask_unet import MaskUNet, MaskUNetConfig
+from gcar_export.parity import PARITY
 
 #: seed of the pictures that parity is checked on
 PARITY_SEED = 70_002

@@ -346,6 +346,8 @@ def test_undefined_values_are_left_out_and_counted():
     summary = evaluation_tables.summarise(rows)[0]["dsc"]
     assert summary == {"mean": 0.5, "sd": None, "n": 1}
     assert "50.00 (n=1)" in evaluation_tables.markdown(rows)
+    # A method that was run on fewer cases than the others says so as well.
+    assert "| b | 50.00 (n=1) |" in evaluation_tables.markdown(rows)
     tests = evaluation_tables.paired_tests(rows, "a")
     assert {t["reason"] for t in tests} == {
         "all differences are zero", "no case on which both are defined",
