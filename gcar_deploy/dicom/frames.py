@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.dicom.header import DAMAGE, Header
+from gcar_deploy.dicom.header import Header
 from gcar_deploy.errors import ImageError
 from gcar_deploy.types import Image
 
@@ -39,14 +39,14 @@ class Frames:
                 warnings.simplefilter("ignore")
                 self._dataset = pydicom.dcmread(BytesIO(header.data))
                 self._decoder: Any = get_decoder(self._dataset.file_meta.TransferSyntaxUID)
-                data = self._dataset.PixelData
-        except DAMAGE:
+                size = len(self._dataset.PixelData)
+        except Exception:  # noqa: BLE001 - pydicom's errors share no base class
             raise ImageError(f"{header.name}: has no readable pixels; export it again") from None
         self._packed = bool(self._decoder.is_encapsulated)
         promised = header.rows * header.columns * header.frames * header.bits // 8
-        if not self._packed and len(data) < promised:
+        if not self._packed and size < promised:
             raise ImageError(
-                f"{header.name}: is truncated ({len(data)} of {promised} bytes of pixels); "
+                f"{header.name}: is truncated ({size} of {promised} bytes of pixels); "
                 "copy or export it again"
             )
         if not self._decoder.is_available:
@@ -77,7 +77,9 @@ class Frames:
                 warnings.simplefilter("ignore")
                 pixels, _ = self._decoder.as_array(self._dataset, index=index, raw=True)
             pixels = np.asarray(pixels).astype(np.int64)
-        except DAMAGE:
+        except ImageError:
+            raise
+        except Exception:  # noqa: BLE001 - pydicom's errors share no base class
             raise ImageError(
                 f"{header.name}: frame {index + 1} cannot be decoded (damaged); export it again"
             ) from None

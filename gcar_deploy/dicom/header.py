@@ -10,9 +10,7 @@ import dataclasses
 import hashlib
 import logging
 import math
-import struct
 import warnings
-import zlib
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -38,12 +36,6 @@ SYNTAXES = {
     "1.2.840.10008.1.2.4.91": True,
 }
 _DEFLATED = b"1.2.840.10008.1.2.1.99"
-#: what a damaged file can raise inside pydicom
-DAMAGE = (
-    ValueError, TypeError, KeyError, AttributeError, IndexError, NotImplementedError, OSError,
-    EOFError, RuntimeError, MemoryError, RecursionError, OverflowError, AssertionError,
-    struct.error, zlib.error,
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,7 +75,7 @@ class Header:
                         if element.VR == "SQ" and element.value and keyword in element.value[0]:
                             return _filled(element.value[0][keyword].value)
                 return _filled(self.dataset.get(keyword))
-        except DAMAGE:
+        except Exception:  # noqa: BLE001 - pydicom's errors share no base class
             raise GeometryError(f"{self.name}: {tag(keyword)} cannot be read") from None
 
     def number(self, keyword: str, frame: int = 0) -> float | None:
@@ -205,7 +197,7 @@ def _header(name: str, data: bytes, limits: DicomLimits) -> Header:
             rows, columns, bits, stored = (int(value or 0) for value in size.values())
             samples = int(dataset.get("SamplesPerPixel") or 1)
             signed = int(dataset.get("PixelRepresentation") or 0)
-    except DAMAGE:
+    except Exception:  # noqa: BLE001 - pydicom's errors share no base class
         raise ValueError("has a damaged header; export it again") from None
     if kind not in (CLASSIC, ENHANCED):
         raise ValueError(f"holds {_kind_name(kind)}; X-ray angiography (XA) is needed")

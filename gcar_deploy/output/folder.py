@@ -27,7 +27,12 @@ def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -
         ``out_dir`` is a link or a file, exists without ``force``, holds an input or the
         working folder, or no folder can be made there.
     """
-    if out_dir.is_symlink():
+    try:
+        linked = out_dir.is_symlink()
+    except OSError as error:  # a name that is too long, a folder that may not be entered
+        name = out_dir.name if len(out_dir.name) < 80 else out_dir.name[:80] + "..."
+        raise UsageError(f"{name} cannot be made ({error.strerror})") from None
+    if linked:
         raise UsageError(f"{out_dir} is a symbolic link; name a folder of its own")
     if out_dir.exists():
         if not out_dir.is_dir():

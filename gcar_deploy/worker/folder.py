@@ -43,8 +43,10 @@ class AllowedFolder:
         """
         path = PurePosixPath(name)
         bad = not name or path.is_absolute() or not path.parts or ".." in path.parts
+        bad |= any(len(part.encode("utf-8", "backslashreplace")) > 255 for part in path.parts)
+        bad |= len(name) > 1024 or not name.isprintable()
         if bad or any(mark in name for mark in ("\0", "\\", ":")):
-            raise UsageError(f"path {name!r}: give a path inside the worker's folder")
+            raise UsageError(f"path {name[:80]!r}: give a path inside the worker's folder")
         return path.parts
 
     def copy(self, name: str, target: Path) -> Path:

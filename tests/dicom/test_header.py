@@ -159,3 +159,21 @@ def test_without_the_extra_one_line_names_it(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and "pip install 'gcar[dicom]'" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.req("REQ-10")
+def test_lengths_that_do_not_fit_their_kind_are_damage(tmp_path):
+    """A number of three bytes, and a run whose pixels are an empty element."""
+    data = as_bytes(classic())
+    at = data.index(b"\x28\x00\x10\x00US\x02\x00")  # Rows
+    odd = tmp_path / "odd.dcm"
+    odd.write_bytes(
+        data[: at + 6] + b"\x03\x00" + data[at + 8 : at + 10] + b"\x00" + data[at + 10 :]
+    )
+    with pytest.raises(ImageError, match="damaged header"):
+        read_header(odd)
+    at = data.index(b"\xe0\x7f\x10\x00")
+    empty = tmp_path / "empty.dcm"
+    empty.write_bytes(data[: at + 8] + b"\x00\x00\x00\x00")
+    with pytest.raises(ImageError, match="pixels"):
+        Frames(read_header(empty))

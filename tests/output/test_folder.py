@@ -175,3 +175,10 @@ def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
     assert errors.strip().splitlines()[-1].startswith("gcar: error:")
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_is_too_long_is_refused(tmp_path):
+    for out in (tmp_path / ("a" * 300), tmp_path / ("a" * 300) / "out"):
+        with pytest.raises(UsageError, match="cannot be made"):
+            check_target(out, force=False)
+    assert list(tmp_path.iterdir()) == []

@@ -31,6 +31,7 @@ Case = Callable[[int, Path], str]
 class Limits:
     """Of one child."""
 
+    #: address space beyond what was mapped at the start
     memory_bytes: int = 2 * 2**30
     cpu_s: float = 5.0
     #: a case that waits for something (a pipe, a lock) uses no processor time
@@ -121,7 +122,10 @@ def _child(case: Case, at: int, end: int, limits: Limits, folder: Path, writer: 
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
-        resource.setrlimit(resource.RLIMIT_AS, (limits.memory_bytes, limits.memory_bytes))
+        # What the libraries have mapped already is not the case's.
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        most = limits.memory_bytes + pages * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for index in range(at, end):
             own = folder / str(index)

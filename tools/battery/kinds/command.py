@@ -38,11 +38,12 @@ _GCAR = (
 _EXPORT = (
     ["verify", "M", "--scenes", "0"],
     ["golden", "M"],
-    ["export", "C", "--out", "O", "--scenes", "0"],
+    ["export", "C", "--out", "X", "--inputs", "8"],
     ["simulate", "L", "O", "--protocol", "paper", "--views", "2"],
     ["evaluate", "--data", "D", "--out", "O", "--methods", "ours,hull", "--views", "2,4"],
     ["score", "D", "--limit", "1"],
-    ["train", "--out", "O", "--help"],
+    # Without --help a valid line would begin hours of work: no folder is named here.
+    ["train", "--help"],
     ["tree-table", "--count", "0"],
 )
 _WORDS = (
@@ -57,7 +58,8 @@ def make(seed: int) -> Case:
     """Return the fuzz case of command lines."""
     # Imported before the fork, so that every child has them already.
     import gcar_export.cli
-    import gcar_export.export_onnx  # noqa: F401
+    import gcar_export.parity
+    import gcar_export.verify  # noqa: F401
 
     def case(index: int, folder: Path) -> str:
         rng = generator("command", seed, index)
@@ -83,7 +85,7 @@ def _files(folder: Path, rng: random.Random) -> dict[str, str]:
         "V": folder / "case" / "view1.png", "W": folder / "case" / "view2.png",
         "G": folder / "case" / "geom.json", "O": folder / "out", "R": folder / "case",
         "M": folder / "m.onnx", "C": folder / "c.safetensors", "L": folder / "label.nii.gz",
-        "D": folder / "data", "P": folder / "pipe",
+        "D": folder / "data", "P": folder / "pipe", "X": folder / "m2.onnx",
     }  # fmt: skip
     paths["D"].mkdir()
     os.mkfifo(paths["P"])
