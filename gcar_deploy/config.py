@@ -244,6 +244,10 @@ class TubeOptions:
     bend: float = 0.15
     #: radius: random walk of its log, 1 / sqrt(mm)
     taper: float = 0.1
+    #: pixels below this at the isocentre show narrow cores, and loosen the taper in proportion, mm
+    taper_pixel_mm: float = 0.85
+    #: ... but at most so many times
+    most_taper_easing: float = 3.0
     #: starting points: standard deviation over 1 mm of centreline, mm
     anchor_mm: float = 1.0
     #: starting radii: standard deviation of the log over 1 mm of centreline
