@@ -157,6 +157,10 @@ class PoseOptions:
     profile_noise: float = 0.05
     #: directions further apart than this are not compared: see ``estimate_poses``
     most_apart_deg: float = 150.0
+    #: three and more views: directions nearer than this tell nothing of each other; and from how
+    #: many starts their offsets are sought together
+    least_apart_deg: float = 10.0
+    joint_starts: int = 60
     #: how well a person marks the same point in two views, mm at the isocentre
     landmark_sigma_mm: float = 0.5
     #: a correction must lower the disagreement to this share of what it was
