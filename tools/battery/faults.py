@@ -69,6 +69,9 @@ ls -A %(disk)s/p
 def faults(kills: int, signals: int, seed: int) -> int:
     """Run all of them; return the number of findings."""
     found: list[str] = []
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        # A shell's background job ignores SIGINT, and so would the processes started here.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="gcar-faults-") as name:
         for verb, work in (
             ("kills", lambda folder: _kills(folder, kills, seed)),
@@ -143,7 +146,7 @@ def _signals(folder: Path, count: int, seed: int) -> tuple[str, list[str]]:
                 time.sleep(chance.uniform(0.2, 1.0) * whole)
                 process.send_signal(number)
                 _, errors = process.communicate(timeout=120)
-            counts[f"exit {process.returncode}"] += 1
+            counts[f"{number.name} exit {process.returncode}"] += 1
             if process.returncode not in (0, 130, 143, -signal.SIGINT, -signal.SIGTERM):
                 found.append(f"{number.name}: exit {process.returncode}: {errors[-300:]!r}")
             if process.returncode > 0 and b"Traceback" in errors:
@@ -151,6 +154,9 @@ def _signals(folder: Path, count: int, seed: int) -> tuple[str, list[str]]:
             found += _whole(out)
             others = [p.name for p in out.parent.iterdir() if p != out]
             found += [f"{number.name} left {others}"] if others else []
+    for name in ("SIGINT", "SIGTERM"):
+        if count >= 10 and counts[f"{name} exit 0"] == (count + (name == "SIGINT")) // 2:
+            found.append(f"no {name} arrived in time: the test is blind")
     return f"{count} of SIGINT, SIGTERM: {_counted(counts)}", found
 
 
