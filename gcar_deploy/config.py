@@ -377,6 +377,9 @@ class QualityOptions:
     #: tenth of the vessels of a view unexplained in all nine pairs of two trees, in one of one
     good_disagreement_raw: float = 0.13
     max_disagreement_raw: float = 0.6
+    #: above this, nine of ten raw pairs of one tree (up to 0.28) are ruled out, and the largest
+    #: part of each picture is asked alone: what else was found may be background
+    parts_disagreement_raw: float = 0.35
     #: share of a view's skeleton that the reprojected tree explains
     good_coverage: float = 0.9
     min_coverage: float = 0.3

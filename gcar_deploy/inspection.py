@@ -17,10 +17,10 @@ from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.geometry.scene import Scene
-from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.quality import check_consistency, check_views
-from gcar_deploy.reconstruct import poses_between
+from gcar_deploy.reconstruct import agreeing
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -97,7 +97,7 @@ def inspect_files(
             view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())
             views.append(view)
-        found.warnings += _consistency(found, views, options)
+        found.warnings += _consistency(found, angiograms, views, options)
     except GcarError as error:
         found.error = error
     return found
@@ -112,8 +112,13 @@ def volume_coverage(carm: CArm, grid: Grid) -> float:
     return float((inside & (pixels[:, 1] < carm.rows - 0.5) & (depth > 0)).mean())
 
 
-def _consistency(found: Inspection, views: Sequence[VesselImage], options: RunOptions) -> list[str]:
-    poses = poses_between(views, options)
+def _consistency(
+    found: Inspection,
+    angiograms: Sequence[Angiogram],
+    views: Sequence[VesselImage],
+    options: RunOptions,
+) -> list[str]:
+    views, poses, apart = agreeing(angiograms, views, options)
     for k, pose in enumerate(poses):
         both = {views[pose.partner].view_id, views[k].view_id}
         for pair in found.pairs:
@@ -122,7 +127,7 @@ def _consistency(found: Inspection, views: Sequence[VesselImage], options: RunOp
                 pair["shift_mm"] = float(np.linalg.norm(pose.offset_mm))
                 pair["after_shift"] = pose.after
     after, partners = [p.after for p in poses], [p.partner for p in poses]
-    return check_consistency(views, after, options.quality, partners)
+    return apart + check_consistency(views, after, options.quality, partners)
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
@@ -90,7 +91,8 @@ def reconstruct(
     with watch.stage("vessels") as report:
         views = _vessels(angiograms, options, segmenter, report, watch)
     with watch.stage("pose"):
-        poses = poses_between(views, options)
+        views, poses, apart = agreeing(angiograms, views, options)
+        findings += apart
         findings += quality.check_poses(
             views, [(p.shift_mm, p.turn_deg) for p in poses], options.quality
         )
@@ -199,6 +201,43 @@ def _vessels(
         views.append(extract_vessels(angiogram, options.imaging, segmenter))
         report(len(views) / len(angiograms))
     return views
+
+
+def agreeing(
+    angiograms: Sequence[Angiogram], views: Sequence[VesselImage], options: RunOptions
+) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
+    """Estimate poses; where raw pictures disagree, from the largest part of each if those agree.
+
+    What was taken for vessel in one picture's background stands apart from the tree as a rule and
+    has no counterpart in the other picture. Parts of a mask that the user gave are never dropped.
+
+    Returns
+    -------
+    views : as given, or their largest connected parts
+    poses : one per view
+    findings : that parts were left out, which makes the result ``degraded``
+    """
+    poses = poses_between(views, options)
+    limits = options.quality
+    worst = max(p.after for p in poses)
+    if all(v.calibrated for v in views) or worst <= limits.parts_disagreement_raw:
+        return list(views), poses, []
+    main = [
+        view if view.calibrated or angiogram.mask is not None else largest_part(view)
+        for angiogram, view in zip(angiograms, views, strict=True)
+    ]
+    if all(a is b for a, b in zip(main, views, strict=True)):
+        return list(views), poses, []
+    closer = poses_between(main, options)
+    if max(p.after for p in closer) > limits.good_disagreement_raw:
+        return list(views), poses, []
+    findings = [
+        f"view {one.view_id}: {1 - one.mask.sum() / view.mask.sum():.0%} of what looks like vessel "
+        "stands apart and has no counterpart in the other views: left out as background"
+        for one, view in zip(main, views, strict=True)
+        if one is not view
+    ]
+    return main, closer, findings
 
 
 def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Pose, ...]:
