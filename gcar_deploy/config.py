@@ -157,6 +157,10 @@ class PoseOptions:
     profile_noise: float = 0.05
     #: directions further apart than this are not compared: see ``estimate_poses``
     most_apart_deg: float = 150.0
+    #: three and more views: directions nearer than this tell nothing of each other; and from how
+    #: many starts their offsets are sought together
+    least_apart_deg: float = 10.0
+    joint_starts: int = 60
     #: how well a person marks the same point in two views, mm at the isocentre
     landmark_sigma_mm: float = 0.5
     #: a correction must lower the disagreement to this share of what it was
@@ -244,6 +248,10 @@ class TubeOptions:
     bend: float = 0.15
     #: radius: random walk of its log, 1 / sqrt(mm)
     taper: float = 0.1
+    #: pixels below this at the isocentre show narrow cores, and loosen the taper in proportion, mm
+    taper_pixel_mm: float = 0.85
+    #: ... but at most so many times
+    most_taper_easing: float = 3.0
     #: starting points: standard deviation over 1 mm of centreline, mm
     anchor_mm: float = 1.0
     #: starting radii: standard deviation of the log over 1 mm of centreline

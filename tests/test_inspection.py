@@ -78,6 +78,28 @@ def test_command_prints_clinical_words(case):
     assert "would be reconstructed" in result.output
 
 
+def test_command_takes_what_run_takes(case):
+    """A shift that only a correction can mend is refused once the correction is off."""
+    pictures, geom = files(case)
+    second = cv2.imread(str(pictures[1]), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(pictures[1]), np.roll(second, 6, axis=0))
+    args = ["validate", *map(str, pictures), "--geom", str(geom), "--json"]
+    found = {
+        name: json.loads(CliRunner().invoke(gcar, [*args, *more]).output.splitlines()[0])
+        for name, more in (("auto", ()), ("off", ("--pose", "off")))
+    }
+    after = {name: one["pairs"][0]["after_shift"] for name, one in found.items()}
+    assert after["auto"] < 0.5 * after["off"]
+    assert found["off"]["would"] == "refuse" and found["off"]["exit_code"] == 6
+
+    outside = CliRunner().invoke(gcar, [*args, "--landmark", "5,5:9999,5"])
+    assert json.loads(outside.output.splitlines()[0])["exit_code"] == 2
+    assert "outside" in json.loads(outside.output.splitlines()[0])["reason"]
+    both = CliRunner().invoke(gcar, [*args, "--pose", "off", "--landmark", "5,5:5,5"])
+    assert both.exit_code != 0 and "--pose off" in str(both.exception)
+    assert CliRunner().invoke(gcar, [*args, "--segmenter", "none"]).exit_code == 2
+
+
 def test_coverage_of_the_volume():
     angiograms, grid, _ = tiny_case()
     carm = angiograms[0].carm

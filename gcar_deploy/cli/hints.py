@@ -27,6 +27,11 @@ def hint_options(function: _Function) -> _Function:
             metavar="PICTURE",
             help=f"Vessel mask of view {k}; it wins over what is found in the picture.",
         )(function)
+    return reading_options(function)
+
+
+def reading_options(function: _Function) -> _Function:
+    """Add --segmenter, --pose and --landmark; see ``hinted``."""
     for option in (
         click.option(
             "--landmark",

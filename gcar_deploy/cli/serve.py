@@ -91,21 +91,22 @@ def serve(
     """  # noqa: D301 - click wants a real backspace
     set_up_logging(verbose, quiet=False)
     limit_threads(threads)
-    limit_memory(memory_mib)
     token = None
     if not stdio:
         token = read_token(token_file)
         with needs_extra("serve", "flask", "waitress", "werkzeug"):
             # Found out before the engine takes its seconds.
             import gcar_deploy.worker.http  # noqa: F401
-    # SIGTERM, like Ctrl-C, ends a server in good order.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     from gcar_deploy.engine import Engine
     from gcar_deploy.worker.folder import AllowedFolder
     from gcar_deploy.worker.jobs import JobQueue
     from gcar_deploy.worker.orders import do_order
 
     allowed = None if folder is None else AllowedFolder(folder)
+    # Only what will serve changes its process: a refused call leaves it as it was.
+    limit_memory(memory_mib)
+    # SIGTERM, like Ctrl-C, ends a server in good order.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     engine = Engine(model, threads=threads, options=run_options(predictor, refiner))
     engine.warmup()
 

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import chosen_dicom, dicom_options
+from gcar_deploy.cli.hints import hinted, reading_options
 
 EXAMPLE = "Example:\n\n  gcar validate view1.png view2.png --geom geom.json"
 
@@ -16,6 +17,7 @@ EXAMPLE = "Example:\n\n  gcar validate view1.png view2.png --geom geom.json"
 @click.argument("pictures", nargs=-1, required=True, type=click.Path(dir_okay=False))
 @click.option("--geom", type=click.Path(dir_okay=False), help="Scene file; DICOM has its own.")
 @dicom_options
+@reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def validate(
     pictures: tuple[str, ...],
@@ -24,6 +26,7 @@ def validate(
     spacing: float | None,
     sod: float | None,
     as_json: bool,
+    **hints: Any,
 ) -> None:
     """Check PICTURES and the scene file without reconstructing.
 
@@ -35,7 +38,7 @@ def validate(
     from gcar_deploy.errors import GcarError
     from gcar_deploy.inspection import inspect_files
 
-    options = RunOptions(dicom=chosen_dicom(frame, spacing, sod))
+    options = hinted(RunOptions(dicom=chosen_dicom(frame, spacing, sod)), hints)
     found = inspect_files(pictures, geom, options)
     click.echo(json.dumps(found.to_dict()) if as_json else "\n".join(_lines(found)))
     if found.error is not None:

@@ -19,10 +19,8 @@ from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
+from gcar_deploy.refine.joint_pose import TOLERANCE, corrected, estimate_jointly
 from gcar_deploy.types import Array, Image, Pixels
-
-#: relative change of the objective or of the pose below which its fit ends
-TOLERANCE = 1e-4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,7 +60,12 @@ class Pose:
 
     def applied(self, carm: CArm) -> CArm:
         """Return the view with the correction built in."""
-        return _corrected(carm, np.array([*self.offset_mm, self.primary_deg, self.secondary_deg]))
+        return corrected(carm, self.theta)
+
+    @property
+    def theta(self) -> Array:
+        """(5,) offset x, y, z in mm, primary and secondary angle in degrees."""
+        return np.array([*self.offset_mm, self.primary_deg, self.secondary_deg])
 
 
 def estimate_poses(
@@ -72,7 +75,8 @@ def estimate_poses(
 
     Each view is compared with that of those already placed whose direction is nearest to 90 deg
     from its own. Nearly opposite views cannot be compared: the line through both sources runs
-    through the picture, and planes about it cut no slices.
+    through the picture, and planes about it cut no slices. Three and more views are then fitted
+    together (``joint_pose``), which sees what each pair alone cannot.
 
     Parameters
     ----------
@@ -103,9 +107,40 @@ def estimate_poses(
             continue
         fixed = dataclasses.replace(placed, carm=poses[partner].applied(placed.carm))
         both = marks[np.isfinite(marks[:, [partner, k]]).all(axis=(1, 2))]
-        found = _estimate(fixed, masses[k], options, (both[:, partner], both[:, k]))
-        poses[k] = dataclasses.replace(found, partner=partner)
-    return tuple(poses[k] for k in range(len(views)))
+        pose = _estimate(fixed, masses[k], options, (both[:, partner], both[:, k]))
+        poses[k] = dataclasses.replace(pose, partner=partner)
+    found = tuple(poses[k] for k in range(len(views)))
+    if len(views) < 3 or not options.enabled:
+        return found
+    theta = estimate_jointly(masses, np.stack([p.theta for p in found]), options, marks)
+    if all(np.array_equal(t, p.theta) for t, p in zip(theta, found, strict=True)):
+        return found
+    return tuple(
+        _joint(k, theta, found[k].partner, masses, options, marks) for k in range(len(views))
+    )
+
+
+def _joint(
+    k: int, theta: Array, partner: int, masses: Sequence[Mass | None], options: PoseOptions,
+    marks: Array,
+) -> Pose:  # fmt: skip
+    """Correction ``theta[k]`` with the agreement with the view's partner before and after."""
+    fixed, moving = masses[partner], masses[k]
+    x, y, z, primary, secondary = (float(value) for value in theta[k])
+    pose = Pose(offset_mm=(x, y, z), primary_deg=primary, secondary_deg=secondary, partner=partner)
+    if partner == k or fixed is None or moving is None:
+        return pose
+    both = marks[np.isfinite(marks[:, [partner, k]]).all(axis=(1, 2))]
+    pixels = both[:, partner], both[:, k]
+    placed = dataclasses.replace(fixed, carm=corrected(fixed.carm, theta[partner]))
+    carm = corrected(moving.carm, theta[k])
+    return dataclasses.replace(
+        pose,
+        before=disagreement(fixed, moving, moving.carm, options.fine_mm),
+        after=disagreement(placed, moving, carm, options.fine_mm),
+        landmark_before_mm=_gap_mm(fixed.carm, moving.carm, pixels),
+        landmark_after_mm=_gap_mm(placed.carm, carm, pixels),
+    )
 
 
 def _estimate(
@@ -138,7 +173,7 @@ def _estimate(
             max_nfev=options.max_evaluations,
         )
         start = solution.x
-    carm = _corrected(moving.carm, start)
+    carm = corrected(moving.carm, start)
     after, gap_after = (
         disagreement(fixed, moving, carm, options.fine_mm),
         _gap_mm(fixed.carm, carm, marks),
@@ -164,7 +199,7 @@ def _residuals(
     theta: Array, fixed: Mass, moving: Mass, prior: Array, sigma_mm: float, options: PoseOptions,
     marks: tuple[Pixels, Pixels],
 ) -> Array:  # fmt: skip
-    carm = _corrected(moving.carm, theta)
+    carm = corrected(moving.carm, theta)
     a, b = mass_profiles(fixed, moving, carm, sigma_mm)
     scale = 1.0 / (options.profile_noise * np.sqrt(float(a @ a)))
     gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
@@ -175,12 +210,3 @@ def _gap_mm(first: CArm, second: CArm, marks: tuple[Pixels, Pixels]) -> float | 
     if len(marks[0]) == 0:
         return None
     return float(np.sqrt(np.mean(ray_gaps(first, second, *marks) ** 2)))
-
-
-def _corrected(carm: CArm, theta: Array) -> CArm:
-    """``theta``: offset x, y, z in mm, primary and secondary angle in degrees."""
-    if not theta.any():
-        return carm
-    if theta[3] or theta[4]:
-        carm = carm.turned(float(theta[3]), float(theta[4]))
-    return carm.moved(theta[:3])

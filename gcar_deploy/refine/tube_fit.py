@@ -100,7 +100,7 @@ class _Run:
 
     def fit(self, tree: Tree, targets: list[Target], steps: int) -> _State:
         """Fit from where the tree is now."""
-        tubes, prior = _start(tree, self.options)
+        tubes, prior = _start(tree, self.options, _pixel_mm(targets))
         prints: list[Footprint] = []
         if tree.branches:
             tubes, prints = fit_level(
@@ -128,10 +128,11 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
         if number and (progress.stopped or progress.failed):
             break
         targets = _contrasts(make_targets(views, level, options), targets)
+        prior = now.prior.at_pixel(_pixel_mm(targets), options)
         tubes, prints = fit_level(
-            now.tubes, targets, now.prior, options, steps, progress, run.should_stop
+            now.tubes, targets, prior, options, steps, progress, run.should_stop
         )
-        now = _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
+        now = _State(tree_of(tubes, now.tree), tubes, prior, prints)
         if number or len(options.levels_mm) == 1:
             continue
         if options.min_share > 0 and len(targets) > 1:
@@ -158,10 +159,15 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     )
 
 
-def _start(tree: Tree, options: TubeOptions) -> tuple[Tubes, Prior]:
+def _pixel_mm(targets: Sequence[Target]) -> float:
+    """Coarsest pixel at the isocentre, mm."""
+    return max(target.pixel_mm for target in targets)
+
+
+def _start(tree: Tree, options: TubeOptions, pixel_mm: float = np.inf) -> tuple[Tubes, Prior]:
     tubes = tubes_of(tree)
     trust = np.concatenate([np.zeros(0), *(branch.confidence for branch in tree.branches)])
-    return tubes, make_prior(tubes, trust, options)
+    return tubes, make_prior(tubes, trust, options, pixel_mm)
 
 
 def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
@@ -218,8 +224,8 @@ def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree
     tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
     own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]
     geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets], options)
-    pixel = max(target.pixel_mm for target in targets)
-    sigma = np.sqrt(own**2 + geometry**2 + (PIXEL_SHARE * pixel) ** 2)
+    pixel = PIXEL_SHARE * _pixel_mm(targets)
+    sigma = np.sqrt(own**2 + geometry**2 + pixel**2)
     branches = [
         dataclasses.replace(branch, sigma_mm=sigma[tubes.point_branch == k])
         for k, branch in enumerate(tree.branches)

@@ -1,4 +1,9 @@
-"""What is known of vessels before the pictures: they bend and taper slowly, near the start."""
+"""What is known of vessels before the pictures: they bend and taper slowly, near the start.
+
+How slowly they taper depends on the pictures' pixel. A random walk of the log radius with one
+step size rounds off the core of a stenosis; where fine pixels show the core, the step is larger
+(``taper_easing``). Coarse pixels need the small one, or the radius follows the pixels' raster.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +30,23 @@ class Prior:
     b : (m,)
     hessian : (unknowns, unknowns) A^T A, with a place for every entry that the pictures add
     slots : (s, 8, 8) where in ``hessian.data`` a segment's unknowns meet
+    start, trust : what it was made of
+    easing : factor on the taper's random walk
     """
 
     A: sparse.csr_matrix
     b: Scalars
     hessian: sparse.csc_matrix
     slots: Array
+    start: Tubes
+    trust: Scalars
+    easing: float
+
+    def at_pixel(self, pixel_mm: float, options: TubeOptions) -> Prior:
+        """Return the prior round the same start for pictures of that pixel."""
+        if taper_easing(pixel_mm, options) == self.easing:
+            return self
+        return make_prior(self.start, self.trust, options, pixel_mm)
 
     def value(self, x: Scalars) -> float:
         """Half the squared norm."""
@@ -51,7 +67,17 @@ class Prior:
         return sparse.csc_matrix((data, H.indices, H.indptr), shape=H.shape)
 
 
-def make_prior(tubes: Tubes, trust: Scalars, options: TubeOptions) -> Prior:
+def taper_easing(pixel_mm: float, options: TubeOptions) -> float:
+    """Return the factor on the taper's random walk for pixels of that edge at the isocentre, mm.
+
+    1 down to ``taper_pixel_mm``, then growing as pixels shrink, to ``most_taper_easing``.
+    """
+    return min(max(options.taper_pixel_mm / pixel_mm, 1.0), options.most_taper_easing)
+
+
+def make_prior(
+    tubes: Tubes, trust: Scalars, options: TubeOptions, pixel_mm: float = np.inf
+) -> Prior:
     """Bending, taper and anchors of a tree at its start, per mm of centreline.
 
     Parameters
@@ -59,13 +85,15 @@ def make_prior(tubes: Tubes, trust: Scalars, options: TubeOptions) -> Prior:
     tubes : Tubes at the start
     trust : (n,) 0 .. 1, confidence in each branch point
     options : TubeOptions
+    pixel_mm : pixel of the pictures at the isocentre
     """
+    easing = taper_easing(pixel_mm, options)
     p, n = len(tubes.positions_mm), len(tubes.log_radius)
     points = tubes.points_mm
     gap = np.maximum(np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1), 1e-3)
     own = np.bincount(tubes.first, 0.5 * gap, n) + np.bincount(tubes.second, 0.5 * gap, n)
     bend = _bending(tubes, gap, options.bend)
-    taper = _taper(tubes, gap, options.taper)
+    taper = _taper(tubes, gap, options.taper * easing)
     weight = np.bincount(tubes.owner, own * np.maximum(trust, LEAST_TRUST), p)
     hold = np.concatenate(
         [
@@ -85,7 +113,7 @@ def make_prior(tubes: Tubes, trust: Scalars, options: TubeOptions) -> Prior:
     ).tocsr()
     b = np.concatenate([np.zeros(3 * bend.shape[0] + len(gap)), hold * start])
     hessian, slots = _with_places((A.T @ A).tocoo(), columns_of(tubes))
-    return Prior(A, b, hessian, slots)
+    return Prior(A, b, hessian, slots, tubes, trust, easing)
 
 
 def columns_of(tubes: Tubes) -> Array:

@@ -89,3 +89,10 @@ def test_a_missing_extra_is_one_line(verb, library, extra, tmp_path):
     )
     assert done.returncode == 2 and f"pip install 'gcar[{extra}]'" in done.stderr
     assert len(done.stderr.splitlines()) == 1 and not list(tmp_path.iterdir())
+
+
+def test_a_refused_call_leaves_its_process_as_it_was(tmp_path):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_AS), signal.getsignal(signal.SIGTERM)
+    assert gcar("serve", "--folder", tmp_path / "absent", "--stdio").code == 2
+    assert (resource.getrlimit(resource.RLIMIT_AS), signal.getsignal(signal.SIGTERM)) == before

@@ -13,11 +13,13 @@ import pytest
 from gcar_deploy.config import PaperOptions
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.gaussians.project import project
 from gcar_deploy.gaussians.voxelize import voxelize
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.refine.paper import MOST_ANISOTROPY, refine_paper
 from tests.gaussians.test_project import random_gaussians
 from tests.hard.phantoms import carm
+from tests.refine.scenes import vessel_image
 from tests.refine.test_paper import views_of
 
 OPTIONS = PaperOptions(steps=12, control_every=5, most_gaussians=60, pixel_mm=2.0, patience=60)
@@ -137,6 +139,77 @@ def test_22_oblong_voxels_keep_the_mass(shape):
     grid = Grid(center_mm=(0, 0, 0), size_mm=(80.0,) * 3, shape=shape)
     mass = voxelize(g, grid).sum(dtype=np.float64) * np.prod(grid.spacing_mm)
     assert mass == pytest.approx(g.masses_mm3().sum(), rel=1e-3)
+
+
+POISONED = PaperOptions(steps=50, control_every=10, most_gaussians=16, pixel_mm=1.0, patience=60)
+#: what each kind of poison does to the Gaussians chosen by ``hit``; what is not finite is last
+POISON = {
+    "scales e^-20": lambda g, hit: g["scales_mm"].__setitem__(hit, np.exp(-20)),
+    "scales e^10": lambda g, hit: g["scales_mm"].__setitem__(hit, np.exp(10)),
+    "needles": lambda g, hit: g["scales_mm"].__setitem__(hit, (np.exp(-20), 1, np.exp(10))),
+    "zero quaternions": lambda g, hit: g["quaternions_wxyz"].__setitem__(hit, 0.0),
+    "huge quaternions": lambda g, hit: g["quaternions_wxyz"].__setitem__(hit, 1e150),
+    "intensity 1e30": lambda g, hit: g["intensity"].__setitem__(hit, 1e30),
+    "intensity -1e30": lambda g, hit: g["intensity"].__setitem__(hit, -1e30),
+    "behind the source": lambda g, hit: g["means_mm"].__setitem__(hit, 2 * SMALL.source_mm),
+    "all in one place": lambda g, hit: g["means_mm"].__setitem__(hit, g["means_mm"][0]),
+    "NaN": lambda g, hit: g["means_mm"].__setitem__(hit, np.nan),
+    "inf": lambda g, hit: g["scales_mm"].__setitem__(hit, np.inf),
+}
+SMALL = carm(-30, -20, rows=12, columns=12, pixel_spacing_mm=(8.0, 8.0))
+
+
+def poisoned(seed, *kinds):
+    """Eight Gaussians of which some, at least one, are poisoned."""
+    rng = np.random.default_rng(seed)
+    g = random_gaussians(8, seed, spread=20, sigma=(1.5, 3.0))
+    arrays = {f.name: getattr(g, f.name) for f in dataclasses.fields(g) if f.name != "sigma_mm"}
+    arrays = {name: value.copy() for name, value in arrays.items()}
+    for kind in kinds:
+        POISON[kind](arrays, rng.permutation(8)[: rng.integers(1, 9)])
+    return arrays
+
+
+@pytest.fixture(scope="module")
+def small():
+    path = project(random_gaussians(8, 5, spread=20, sigma=(1.5, 3.0)), SMALL)
+    return [vessel_image(SMALL, path)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 200, 20))
+def test_200_poisoned_starts_stay_bounded_over_50_steps(small, first):
+    kinds = list(POISON)
+    for seed in range(first, first + 20):
+        # One kind, or from the second round on two at once.
+        pair = sorted({seed % 11, (seed // 11) * (seed % 11) % 11})
+        chosen = [kinds[k] for k in pair]
+        arrays = poisoned(seed, *chosen)
+        if chosen[-1] in ("NaN", "inf"):
+            with pytest.raises(UsageError, match="not finite"):
+                Gaussians(**arrays)
+            # Past that door, as if a number broke inside the optimiser.
+            start = random_gaussians(8, seed)
+            for name, value in arrays.items():
+                object.__setattr__(start, name, value)
+            try:
+                out = refine_paper(start, small, POISONED)
+            except UsageError as error:
+                assert "not finite" in str(error)
+                continue
+        else:
+            out = refine_paper(Gaussians(**arrays), small, POISONED)
+        check(out, POISONED)
+        assert out.status == "failed" or out.steps + out.rejected_steps == 50
+
+
+@pytest.mark.slow
+def test_thousands_of_duplicates_over_50_steps(small):
+    one = random_gaussians(8, 5, spread=20, sigma=(1.5, 3.0)).select(np.zeros(2000, np.int64))
+    options = dataclasses.replace(POISONED, most_gaussians=2000)
+    out = refine_paper(one, small, options)
+    check(out, options)
+    assert out.steps + out.rejected_steps == 50
 
 
 def test_pictures_of_unknown_scale_find_their_contrast(views):

@@ -1,0 +1,177 @@
+"""Pose of three or more views at once, from the epipolar consistency of every pair.
+
+One pair sees a shift along the normal of its own epipolar planes alone. A third view that does
+not lie in the plane of the first two has another normal with each of them, so what is hidden
+from one pair is seen by the next: all pairs together form one least-squares problem, in which
+only directions that no pair sees are left to the prior.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares, minimize
+
+from gcar_deploy.config import PoseOptions
+from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles
+from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
+from gcar_deploy.types import Array, Scalars
+
+#: relative change of the objective or of the pose below which a fit ends
+TOLERANCE = 1e-4
+
+
+def corrected(carm: CArm, theta: Array) -> CArm:
+    """Return the view after ``theta``: offset x, y, z in mm, primary and secondary in degrees."""
+    if not theta.any():
+        return carm
+    if theta[3] or theta[4]:
+        carm = carm.turned(float(theta[3]), float(theta[4]))
+    return carm.moved(theta[:3])
+
+
+def estimate_jointly(
+    masses: Sequence[Mass | None], first: Array, options: PoseOptions, marks: Array
+) -> Array:
+    """Estimate the corrections of all views but the first from all pairs.
+
+    Parameters
+    ----------
+    masses : V views, as they are told
+    first : (V, 5) corrections found pair by pair, the first of them zero: one of the starts
+    options : PoseOptions
+    marks : (m, V, 2) landmarks, (col, row), nan where not seen
+
+    Returns
+    -------
+    (V, 5) corrections; ``first`` where fewer than three pairs can be compared, or where all pairs
+    together do not agree better after the joint fit
+    """
+    seen = {k: mass for k, mass in enumerate(masses) if mass is not None}
+    problem = _Problem(seen, options, marks)
+    if len(problem.pairs) < 3:
+        return first
+    theta = problem.fitted(problem.shifts(first))
+    if problem.mean_disagreement(theta) >= problem.mean_disagreement(first):
+        return first
+    return problem.without_the_needless(theta)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Problem:
+    """All pairs that can be compared, and the priors; ``seen`` are the views with vessels."""
+
+    seen: dict[int, Mass]
+    options: PoseOptions
+    marks: Array
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs with vessels whose planes cut slices: neither nearly parallel nor opposite."""
+        out = []
+        for i, j in itertools.combinations(self.seen, 2):
+            apart = separation_deg(self.seen[i].carm, self.seen[j].carm)
+            if self.options.least_apart_deg <= apart <= self.options.most_apart_deg:
+                out.append((i, j))
+        return out
+
+    @property
+    def prior(self) -> Array:
+        return np.array([self.options.offset_sigma_mm] * 3 + [self.options.angle_sigma_deg] * 2)
+
+    def pair(self, i: int, j: int, theta: Array) -> tuple[Mass, Mass, CArm]:
+        """Both views with the correction of the first built in, and the second's C-arm."""
+        a, b = self.seen[i], self.seen[j]
+        fixed = dataclasses.replace(a, carm=corrected(a.carm, theta[i]))
+        return fixed, b, corrected(b.carm, theta[j])
+
+    def differences(self, i: int, j: int, theta: Array, sigma_mm: float) -> Scalars:
+        """Profile of one view minus that of the other, in units of its usual error."""
+        fixed, moving, carm = self.pair(i, j, theta)
+        a, b = mass_profiles(fixed, moving, carm, sigma_mm)
+        out: Scalars = (a - b) / (self.options.profile_noise * np.sqrt(float(a @ a)))
+        return out
+
+    def residuals(self, x: Array, sigma_mm: float) -> Scalars:
+        """All differences, landmark gaps and corrections over their standard deviations."""
+        theta = np.vstack([np.zeros(5), x.reshape(-1, 5)])
+        parts = [(theta[1:] / self.prior).ravel()]
+        for i, j in self.pairs:
+            parts.append(self.differences(i, j, theta, sigma_mm))
+            seen = self.marks[np.isfinite(self.marks[:, [i, j]]).all(axis=(1, 2))]
+            if len(seen):
+                fixed, _, carm = self.pair(i, j, theta)
+                gaps = ray_gaps(fixed.carm, carm, seen[:, i], seen[:, j])
+                parts.append(gaps / self.options.landmark_sigma_mm)
+        return np.concatenate(parts)
+
+    def mean_disagreement(self, theta: Array, view: int | None = None) -> float:
+        """Mean over the pairs, or over those of one view."""
+        pairs = [p for p in self.pairs if view is None or view in p]
+        values = [disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in pairs]
+        return float(np.mean(values)) if values else 0.0
+
+    def shifts(self, first: Array) -> Array:
+        """(V, 5) start: offsets that suit all pairs best, angles zero.
+
+        A shift moves a pair's profiles against each other by its share along the pair's normal.
+        So each pair is asked once for its misfit at every such shift, and the offsets are sought
+        on those curves, from many starts: profiles that are far off have many local minima.
+        """
+        o = self.options
+        steps = np.arange(-2 * o.search_mm, 2 * o.search_mm + 1e-9, o.step_mm)
+        zero, curves = np.zeros_like(first), []
+        for i, j in self.pairs:
+            fixed, moving, _ = self.pair(i, j, zero)
+            normal = plane_normal(fixed.carm, moving.carm)
+            misfit = []
+            for step in steps:
+                at = zero.copy()
+                at[j, :3] = step * normal
+                misfit.append(float(np.sum(self.differences(i, j, at, o.coarse_mm) ** 2)))
+            curves.append((i, j, normal, CubicSpline(steps, misfit, bc_type="clamped")))
+
+        def cost(x: Array) -> tuple[float, Array]:
+            d = np.vstack([np.zeros(3), x.reshape(-1, 3)])
+            value = float(np.sum((d / o.offset_sigma_mm) ** 2))
+            slope = 2.0 * d / o.offset_sigma_mm**2
+            for i, j, normal, curve in curves:
+                along = float(np.clip(normal @ (d[j] - d[i]), steps[0], steps[-1]))
+                value += float(curve(along))
+                pull = float(curve(along, 1)) * normal
+                slope[j] += pull
+                slope[i] -= pull
+            return value, slope[1:].ravel()
+
+        rng = np.random.default_rng(0)
+        spread = rng.normal(0.0, 2.0 * o.offset_sigma_mm, (o.joint_starts, 3 * (len(first) - 1)))
+        starts = [first[1:, :3].ravel(), np.zeros(3 * (len(first) - 1)), *spread]
+        found = [minimize(cost, s, jac=True, method="L-BFGS-B") for s in starts]
+        out = zero.copy()
+        out[1:, :3] = min(found, key=lambda f: float(f.fun)).x.reshape(-1, 3)
+        return out
+
+    def fitted(self, theta: Array) -> Array:
+        """(V, 5) offsets and angles together, from coarse to fine profiles."""
+        x, prior = theta[1:].ravel(), np.tile(self.prior, len(theta) - 1)
+        for sigma in (self.options.coarse_mm, self.options.fine_mm):
+            x = least_squares(
+                self.residuals, x, args=(sigma,), diff_step=1e-3, x_scale=prior,
+                ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=self.options.max_evaluations,
+            ).x  # fmt: skip
+        return np.vstack([np.zeros(5), x.reshape(-1, 5)])
+
+    def without_the_needless(self, theta: Array) -> Array:
+        """Leave a view alone whose correction does not clearly help it to agree."""
+        for k in range(1, len(theta)):
+            less = theta.copy()
+            less[k] = 0.0
+            alone = self.mean_disagreement(less, k)
+            if self.mean_disagreement(theta, k) > self.options.min_gain * alone:
+                theta = less
+        return theta
