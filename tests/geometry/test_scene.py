@@ -336,3 +336,14 @@ def test_any_text_is_refused_in_one_line(text):
     with pytest.raises(GeometryError) as caught:
         parse_scene(text)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.req("REQ-01")
+def test_row_spacing_comes_first():
+    """Order (row, column) as in DICOM: the second number is the pitch along a row."""
+    data = copy.deepcopy(SCENE)
+    data["views"][0]["pixel_spacing_mm"] = [0.2, 0.4]
+    carm = parse_scene(json.dumps(data)).views[0].carm
+    f_col, f_row = carm.focal_px
+    assert f_col == pytest.approx(carm.sdd_mm / 0.4)
+    assert f_row == pytest.approx(carm.sdd_mm / 0.2)

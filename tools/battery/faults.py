@@ -147,6 +147,8 @@ def _signals(folder: Path, count: int, seed: int) -> tuple[str, list[str]]:
                 process.send_signal(number)
                 _, errors = process.communicate(timeout=120)
             counts[f"{number.name} exit {process.returncode}"] += 1
+            if process.returncode == 0:  # too late: the machine has become faster
+                whole *= 0.8
             if process.returncode not in (0, 130, 143, -signal.SIGINT, -signal.SIGTERM):
                 found.append(f"{number.name}: exit {process.returncode}: {errors[-300:]!r}")
             if process.returncode > 0 and b"Traceback" in errors:
