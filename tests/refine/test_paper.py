@@ -192,3 +192,12 @@ def test_poisoned_starts_stay_finite_and_bounded(kind):
             assert np.isfinite(a).all()
         if out.losses:
             assert min(out.losses) <= out.losses[0]
+
+
+@pytest.mark.req("REQ-43")
+def test_alpha_is_the_share_of_the_whole_picture():
+    """A residual of 1 mm on the k skeleton pixels of n: alpha k / n + (1 - alpha)."""
+    picture, skeleton = np.zeros((8, 10)), np.zeros((8, 10), bool)
+    skeleton[3] = True
+    loss, _ = projection_loss(skeleton * 1.0, picture, skeleton, np.ones((8, 10), bool), 0.8)
+    assert loss == pytest.approx(0.8 * 10 / 80 + 0.2)
