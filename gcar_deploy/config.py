@@ -161,6 +161,11 @@ class PoseOptions:
     #: many starts their offsets are sought together
     least_apart_deg: float = 10.0
     joint_starts: int = 60
+    #: more views than this are corrected pair by pair alone; pairs that disagree by no more than
+    #: this as they are told, are left alone (four views of one tree, exactly placed, pixels of
+    #: 1.4 mm: up to 0.08)
+    joint_most_views: int = 4
+    agreed: float = 0.09
     #: how well a person marks the same point in two views, mm at the isocentre
     landmark_sigma_mm: float = 0.5
     #: a correction must lower the disagreement to this share of what it was

@@ -49,12 +49,15 @@ def estimate_jointly(
 
     Returns
     -------
-    (V, 5) corrections; ``first`` where fewer than three pairs can be compared, or where all pairs
-    together do not agree better after the joint fit
+    (V, 5) corrections; ``first`` where fewer than three pairs can be compared, where there are
+    more views than ``joint_most_views`` (the cost grows with their cube), where all pairs agree as
+    they are told, or where all pairs together do not agree better after the joint fit
     """
     seen = {k: mass for k, mass in enumerate(masses) if mass is not None}
     problem = _Problem(seen, options, marks)
-    if len(problem.pairs) < 3:
+    if len(problem.pairs) < 3 or len(seen) > options.joint_most_views:
+        return first
+    if not first.any() and problem.worst_disagreement(first) <= options.agreed:
         return first
     theta = problem.fitted(problem.shifts(first))
     if problem.mean_disagreement(theta) >= problem.mean_disagreement(first):
@@ -115,6 +118,10 @@ class _Problem:
         pairs = [p for p in self.pairs if view is None or view in p]
         values = [disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in pairs]
         return float(np.mean(values)) if values else 0.0
+
+    def worst_disagreement(self, theta: Array) -> float:
+        """Of all pairs."""
+        return max(disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in self.pairs)
 
     def shifts(self, first: Array) -> Array:
         """(V, 5) start: offsets that suit all pairs best, angles zero.
