@@ -57,7 +57,7 @@ def estimate_jointly(
     problem = _Problem(seen, options, marks)
     if len(problem.pairs) < 3 or len(seen) > options.joint_most_views:
         return first
-    if not first.any() and problem.worst_disagreement(first) <= options.agreed:
+    if not first.any() and max(problem.disagreements(first)) <= options.agreed:
         return first
     theta = problem.fitted(problem.shifts(first))
     if problem.mean_disagreement(theta) >= problem.mean_disagreement(first):
@@ -113,15 +113,15 @@ class _Problem:
                 parts.append(gaps / self.options.landmark_sigma_mm)
         return np.concatenate(parts)
 
+    def disagreements(self, theta: Array, view: int | None = None) -> list[float]:
+        """Of every pair, or of those of one view, 0 (equal) .. 1 (disjoint)."""
+        pairs = [p for p in self.pairs if view is None or view in p]
+        return [disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in pairs]
+
     def mean_disagreement(self, theta: Array, view: int | None = None) -> float:
         """Mean over the pairs, or over those of one view."""
-        pairs = [p for p in self.pairs if view is None or view in p]
-        values = [disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in pairs]
+        values = self.disagreements(theta, view)
         return float(np.mean(values)) if values else 0.0
-
-    def worst_disagreement(self, theta: Array) -> float:
-        """Of all pairs."""
-        return max(disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in self.pairs)
 
     def shifts(self, first: Array) -> Array:
         """(V, 5) start: offsets that suit all pairs best, angles zero.
