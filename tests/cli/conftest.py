@@ -7,13 +7,13 @@ import dataclasses
 import io
 import json
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from gcar_deploy.selftest import tiny_case
+from tools.battery.cases import geometry
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,35 +41,8 @@ def gcar(*arguments: object) -> Outcome:
 def good_case(tmp_path_factory) -> Path:
     """Folder with view1.png, view2.png, geom.json of a small generated tree."""
     folder = tmp_path_factory.mktemp("case")
-    angiograms, grid, _ = tiny_case()
-    views: list[dict[str, Any]] = []
+    angiograms, _, _ = tiny_case()
     for number, angiogram in enumerate(angiograms, start=1):
         cv2.imwrite(str(folder / f"view{number}.png"), angiogram.pixels.astype(np.uint16))
-        carm = angiogram.carm
-        views.append(
-            {
-                "id": str(number),
-                "primary_angle_deg": carm.primary_angle_deg,
-                "secondary_angle_deg": carm.secondary_angle_deg,
-                "sod_mm": carm.sod_mm,
-                "sdd_mm": carm.sdd_mm,
-                "rows": carm.rows,
-                "columns": carm.columns,
-                "pixel_spacing_mm": list(carm.pixel_spacing_mm),
-                "intensity": {
-                    "kind": "path_length", "polarity": "bright", "mm_per_count": 0.001,
-                },
-            }
-        )  # fmt: skip
-    geometry = {
-        "schema": "gcar-geometry/1",
-        "frame": "LPS",
-        "views": views,
-        "volume": {
-            "center_mm": list(grid.center_mm),
-            "size_mm": list(grid.size_mm),
-            "shape": list(grid.shape),
-        },
-    }
-    (folder / "geom.json").write_text(json.dumps(geometry))
+    (folder / "geom.json").write_text(json.dumps(geometry()))
     return folder
