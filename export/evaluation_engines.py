@@ -60,13 +60,11 @@ def run_in_processes(
             for future in concurrent.futures.as_completed(waiting):
                 yield waiting[future], future.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            workers = set(multiprocessing.active_children()) - others
-            for worker in workers:
+            for future in waiting:
+                future.cancel()
+            for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
-            for worker in workers:
-                worker.join()
-            raise
+            raise  # leaving the pool waits for the ends of its workers
 
 
 def _leave_interrupts_to_the_parent() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -141,9 +142,21 @@ def test_wrong_calls(tmp_path, listening):
         Listener(queue, tmp_path, title="GCAR").start(port)
 
 
+def dcmtk_storescu() -> str | None:
+    """Return DCMTK's own storescu: pynetdicom installs a script of the same name."""
+    for folder in os.get_exec_path():
+        path = shutil.which("storescu", path=folder)
+        if path is None:
+            continue
+        said = subprocess.run([path, "--version"], capture_output=True, text=True, check=False)
+        if "$dcmtk" in said.stdout:
+            return path
+    return None
+
+
 SENDERS = {
     "pynetdicom": [sys.executable, "-m", "pynetdicom", "storescu"],
-    "dcmtk": [shutil.which("storescu")],
+    "dcmtk": [dcmtk_storescu()],
 }
 
 

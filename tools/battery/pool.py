@@ -33,7 +33,8 @@ class Limits:
 
     #: address space beyond what was mapped at the start
     memory_bytes: int = 2 * 2**30
-    cpu_s: float = 5.0
+    #: told for every kind; the limit itself only ends what would not end
+    cpu_s: float = 30.0
     #: a case that waits for something (a pipe, a lock) uses no processor time
     wall_s: float = 300.0
 
