@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import VolumeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.carm import separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.refine.settle import scatter_is_none
@@ -46,6 +47,10 @@ TUBE_ERROR = 0.18
 #: what a predictor gets wrong beyond that it gets wrong for whole stretches, not voxel by voxel:
 #: its excess variance counts so many times.
 BIAS_WEIGHT = 12.0
+#: views that differ by less make the same errors of voxels: how far a vessel fills its voxels
+#: looks alike from both. Measured on generated trees: with views 11 deg apart the pictures' pull
+#: errs 2 to 3 times as much as independent errors would, at 45 deg and more as much, deg (sigma)
+SAME_DIRECTION_DEG = 12.0
 CG_STEPS = 40
 CG_TOLERANCE = 2e-2
 
@@ -197,6 +202,7 @@ def _pictures(
     operators: list[sparse.csr_matrix] = []
     errors: list[Scalars] = []
     variances: list[Scalars] = []
+    alike = _alike(views)
     for k, (view, factor) in enumerate(zip(views, contrast, strict=True)):
         if not view.calibrated:
             continue
@@ -211,8 +217,17 @@ def _pictures(
         operators.append(cells.matrix)
         errors.append(rest.reshape(-1)[cells.pixel].astype(np.float64))
         path = cells.path_mm.reshape(-1)[cells.pixel].astype(np.float64)
-        variances.append((options.noise_mm + options.noise_share * path) ** 2)
+        variances.append(alike[k] * (options.noise_mm + options.noise_share * path) ** 2)
     return operators, errors, variances
+
+
+def _alike(views: Sequence[VesselImage]) -> Scalars:
+    """Count the views that see what each view sees, itself among them: (views,), 1 and above."""
+    apart = np.array([separation_deg(a.carm, b.carm) for a in views for b in views])
+    # From the front and from the back the paths are the same.
+    apart = np.minimum(apart, 180.0 - apart).reshape(len(views), len(views))
+    out: Scalars = np.exp(-0.5 * (apart / SAME_DIRECTION_DEG) ** 2).sum(axis=1)
+    return out
 
 
 def _points(
