@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TubeOptions, VolumeOptions
@@ -93,3 +94,45 @@ def test_a_view_given_twice_tells_the_volume_nothing_new():
     once, thrice = volume(1), volume(3)
     assert np.abs(once - round_only).max() > 0.1
     np.testing.assert_allclose(thrice, once, atol=0.01)
+
+
+@pytest.mark.slow
+def test_more_views_are_never_worse():
+    """A generated tree (seed of its own) in the paper's set-up, from pictures to voxels."""
+    from gcar_deploy.engine import Engine
+    from gcar_deploy.geometry.scene import Intensity
+    from gcar_deploy.imaging.angiogram import Angiogram
+    from gcar_deploy.metrics import volume_measures
+    from gcar_export.protocols import case_geometry
+    from gcar_export.render import occupancy, path_lengths
+    from gcar_export.trees import random_tree
+
+    segments = random_tree(np.random.default_rng([905, 1])).segments()
+    engine, found = Engine(), {}
+    for count in (2, 8, 16):
+        carms, where = case_geometry("paper", count)
+        pictures = [
+            Angiogram(
+                view_id=str(k + 1),
+                carm=view,
+                pixels=path_lengths(view, *segments),
+                bit_depth=16,
+                intensity=Intensity(kind="path_length", polarity="bright", mm_per_count=1.0),
+                sha256=str(k),
+            )
+            for k, view in enumerate(carms)
+        ]
+        volume = engine.reconstruct(pictures, where).volume
+        if not found:
+            near = np.zeros(where.shape, bool)
+            near[tuple(np.rint(where.world2index(segments[0])).astype(int).T)] = True
+            near = ndimage.binary_dilation(near, np.ones((3, 3, 3)), iterations=4)
+            truth = np.zeros(where.shape, np.float32)
+            points = where.index2world(np.argwhere(near))
+            truth[near], _, _ = occupancy(points, float(where.spacing_mm[0]), *segments)
+        measures = volume_measures(truth, volume, where.spacing_mm)
+        found[count] = measures["dsc"].value, measures["ot_2mm"].value
+    assert found[8][0] > found[2][0] + 0.02
+    for few, many in ((2, 8), (8, 16)):
+        assert found[many][0] >= found[few][0] - 0.005, found
+        assert found[many][1] >= found[few][1] - 0.005, found
