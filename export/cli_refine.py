@@ -68,7 +68,8 @@ def cost_curves() -> None:
 @click.option("--trees", default=10, show_default=True, help="Trees per row.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
 @click.option("--predictors", default="multi,none", show_default=True)
-def sigma_table(seed: int, trees: int, protocols: str, predictors: str) -> None:
+@click.option("--parts", is_flag=True, help="Also what sigma is worth without some of its parts.")
+def sigma_table(seed: int, trees: int, protocols: str, predictors: str, parts: bool) -> None:
     """Compare the stated sigma with true errors on generated trees.
 
     Example: gcar-export sigma-table --seed 2 --trees 20
@@ -84,7 +85,8 @@ def sigma_table(seed: int, trees: int, protocols: str, predictors: str) -> None:
     rows = []
     with click.progressbar(length=len(cells) * trees, label="trees", file=sys.stderr) as bar:
         for cell in cells:
-            rows.append(
-                sigma.calibrate(*cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1))
+            made = sigma.calibrate_parts(
+                *cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1)
             )
+            rows += made if parts else made[-1:]
     click.echo(sigma.table(rows))

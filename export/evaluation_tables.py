@@ -220,8 +220,11 @@ def not_first(rows: Sequence[Mapping[str, Any]], reference: str) -> list[str]:
         tests = [t for t in paired_tests(group, reference) if t["n"]]
         for (name,), column_tests in grouped(tests, ("measure",)).items():
             column = MEASURES[name]
-            behind, close = [], []
+            behind, close, equal = [], [], []
             for test in column_tests:
+                if not test["mean_difference"] and test["p"] is None:
+                    equal.append(f"{test['method']} (n={test['n']})")
+                    continue
                 ahead = test["mean_difference"] * column.better * column.factor
                 p = test["reason"] if test["p"] is None else f"p = {test['p']:.3f}"
                 if ahead <= 0:
@@ -230,6 +233,8 @@ def not_first(rows: Sequence[Mapping[str, Any]], reference: str) -> list[str]:
                     close.append(f"{test['method']} (by {ahead:.2f}, {p}, n={test['n']})")
             if close:
                 behind.append(f"not significantly ahead of {', '.join(close)}")
+            if equal:
+                behind.append(f"equal in every case: {', '.join(equal)}")
             if behind:
                 where = f"{protocol}, {views} views, {column.heading}"
                 out.append(f"{where}: {'; '.join(behind)}")

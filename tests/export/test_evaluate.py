@@ -316,6 +316,9 @@ def test_the_text_says_where_the_reference_is_not_first():
     (said,) = evaluation_tables.not_first(rows, "ours")
     assert said.startswith("paper, 2 views, DSC(0.5) %: sart leads by 6.00 (p = 0.004, n=9)")
     assert "not significantly ahead of fdk (by 0.89, p = " in said
+    rows += [{**row, "method": "ours-nopose"} for row in rows if row["method"] == "ours"]
+    (said,) = evaluation_tables.not_first(rows, "ours")
+    assert said.endswith("; equal in every case: ours-nopose (n=9)")
 
 
 def test_paper_layout_keeps_datasets_apart_and_marks_printed_figures():
