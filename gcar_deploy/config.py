@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import TypeAlias
 
+from gcar_deploy.pose_options import BundleOptions as BundleOptions
+from gcar_deploy.pose_options import PoseOptions as PoseOptions
+
 #: (col, row) of one point in each view, None where it is not seen
 Landmark: TypeAlias = "tuple[tuple[float, float] | None, ...]"
 
@@ -136,41 +139,6 @@ class CandidateOptions:
     thinning_steps: int = 40
     #: power applied after each pass; above 1 weak shares give way to strong ones
     thinning_sharpness: float = 1.05
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PoseOptions:
-    """Table or breath shift and angle error between views, from epipolar consistency."""
-
-    enabled: bool = True
-    #: priors, one standard deviation: how far a patient moves between runs, how well angles are
-    #: read; a direction the pictures say nothing about stays at zero
-    offset_sigma_mm: float = 3.0
-    angle_sigma_deg: float = 0.7
-    #: first search along the direction that two views see best, mm
-    search_mm: float = 12.0
-    step_mm: float = 1.0
-    #: smoothing of the mass profiles, mm at the isocentre
-    coarse_mm: float = 1.5
-    fine_mm: float = 0.5
-    #: how well two profiles of the same tree agree, as a share of their norm
-    profile_noise: float = 0.05
-    #: directions further apart than this are not compared: see ``estimate_poses``
-    most_apart_deg: float = 150.0
-    #: three and more views: directions nearer than this tell nothing of each other; and from how
-    #: many starts their offsets are sought together
-    least_apart_deg: float = 10.0
-    joint_starts: int = 60
-    #: more views than this are corrected pair by pair alone; pairs that disagree by no more than
-    #: this as they are told, are left alone (four views of one tree, exactly placed, pixels of
-    #: 1.4 mm: up to 0.08)
-    joint_most_views: int = 4
-    agreed: float = 0.09
-    #: how well a person marks the same point in two views, mm at the isocentre
-    landmark_sigma_mm: float = 0.5
-    #: a correction must lower the disagreement to this share of what it was
-    min_gain: float = 0.85
-    max_evaluations: int = 40
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -410,6 +378,7 @@ class RunOptions:
     dicom: DicomOptions = dataclasses.field(default_factory=DicomOptions)
     imaging: ImagingOptions = dataclasses.field(default_factory=ImagingOptions)
     pose: PoseOptions = dataclasses.field(default_factory=PoseOptions)
+    bundle: BundleOptions = dataclasses.field(default_factory=BundleOptions)
     candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)
     predict: PredictOptions = dataclasses.field(default_factory=PredictOptions)
     decide: DecideOptions = dataclasses.field(default_factory=DecideOptions)

@@ -13,12 +13,12 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "gcar_deploy"
 #: lower numbers never import higher ones; rooms on one floor keep apart unless listed below
 FLOORS = {
-    "errors": 0, "types": 0, "config": 0, "files": 0, "stopwatch": 1,
+    "pose_options": -1, "errors": 0, "types": 0, "config": 0, "files": 0, "stopwatch": 1,
     "geometry": 1,
     "imaging": 2, "gaussians": 2,
     "tree": 3, "dicom": 3,
     "predict": 4, "refine": 4,
-    "quality": 5, "metrics": 5, "alternatives": 5,
+    "quality": 5, "metrics": 5, "alternatives": 5, "bundling": 5,
     "output": 6,
     "selftest": 6, "data": 6,
     "reconstruct": 7,

@@ -1,0 +1,66 @@
+"""Options of the poses between runs; ``config`` hands them on with all others."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """Table or breath shift and angle error between views, from epipolar consistency."""
+
+    enabled: bool = True
+    #: priors, one standard deviation: how far a patient moves between runs, how well angles are
+    #: read; a direction the pictures say nothing about stays at zero
+    offset_sigma_mm: float = 3.0
+    angle_sigma_deg: float = 0.7
+    #: first search along the direction that two views see best, mm
+    search_mm: float = 12.0
+    step_mm: float = 1.0
+    #: smoothing of the mass profiles, mm at the isocentre
+    coarse_mm: float = 1.5
+    fine_mm: float = 0.5
+    #: how well two profiles of the same tree agree, as a share of their norm
+    profile_noise: float = 0.05
+    #: directions further apart than this are not compared: see ``estimate_poses``
+    most_apart_deg: float = 150.0
+    #: three and more views: directions nearer than this tell nothing of each other; and from how
+    #: many starts their offsets are sought together
+    least_apart_deg: float = 10.0
+    joint_starts: int = 60
+    #: more views than this are corrected pair by pair alone; pairs that disagree by no more than
+    #: this as they are told, are left alone (four views of one tree, exactly placed, pixels of
+    #: 1.4 mm: up to 0.08)
+    joint_most_views: int = 4
+    agreed: float = 0.09
+    #: how well a person marks the same point in two views, mm at the isocentre
+    landmark_sigma_mm: float = 0.5
+    #: a correction must lower the disagreement to this share of what it was
+    min_gain: float = 0.85
+    max_evaluations: int = 40
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BundleOptions:
+    """Offsets of three and more views from the tree they show (see ``refine/bundle.py``)."""
+
+    #: a tree and its views' poses are fitted to each other at most so often
+    rounds: int = 2
+    #: breath and table: scale of the offset's prior, whose tails are heavy (Cauchy)
+    offset_scale_mm: float = 3.0
+    angle_sigma_deg: float = 0.7
+    #: one standard deviation of a picture's centreline (neighbours err alike, so this is more
+    #: than a single point's error), and of a point's step
+    line_sigma_mm: float = 1.0
+    point_sigma_mm: float = 2.0
+    #: a picture's line counts for a point within this reach, which shrinks to the second
+    reach_mm: float = 8.0
+    near_mm: float = 2.0
+    steps: int = 25
+    #: points of the tree this far apart, and how few say nothing
+    spacing_mm: float = 2.0
+    least_points: int = 20
+    #: a tree that lies this near to all lines, in pixels, is left alone (16 generated scenes, moved
+    #: and corrected by profiles: 0.2 .. 0.5); else the distance must fall to a share of what it was
+    least_px: float = 0.6
+    min_gain: float = 0.85
