@@ -10,6 +10,7 @@ import numpy as np
 from gcar_deploy.config import RunOptions
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.refine.bundle import adjust
+from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose
 from gcar_deploy.tree.tree import Tree
 
@@ -42,10 +43,11 @@ def bundled(
     poses = tuple(poses)
     if len(views) < 3 or not options.pose.enabled or not any(p.theta.any() for p in poses):
         return poses
+    marks = landmark_pixels(options.landmarks, told)
     for _ in range(o.rounds):
         theta = np.stack([pose.theta for pose in poses])
         tree = tree_of([posed(view, pose) for view, pose in zip(views, poses, strict=True)])
-        found = adjust(tree, views, told, theta, o)
+        found = adjust(tree, views, told, theta, o, marks)
         near_mm = o.least_px * max(carm.pixel_at_isocenter_mm for carm in told)
         if found.before_mm < near_mm or found.after_mm >= o.min_gain * found.before_mm:
             break

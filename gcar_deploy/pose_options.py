@@ -53,6 +53,8 @@ class BundleOptions:
     #: than a single point's error), and of a point's step
     line_sigma_mm: float = 1.0
     point_sigma_mm: float = 2.0
+    #: how well a person marks the same point in two views, mm at the isocentre
+    landmark_sigma_mm: float = 0.5
     #: a picture's line counts for a point within this reach, which shrinks to the second
     reach_mm: float = 8.0
     near_mm: float = 2.0

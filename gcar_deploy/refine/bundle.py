@@ -12,6 +12,7 @@ along a vessel it is.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import cv2
@@ -19,12 +20,13 @@ import numpy as np
 
 from gcar_deploy.config import BundleOptions
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.epipolar import ray_gaps
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.refine.joint_pose import corrected
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Points, Scalars
 
-#: step of a turn for its derivative, degrees
+#: step of a correction for its derivative, degrees or mm
 _TURN_DEG = 0.05
 
 
@@ -47,7 +49,7 @@ class Adjusted:
 
 def adjust(
     tree: Tree, views: Sequence[VesselImage], told: Sequence[CArm], theta: Array,
-    options: BundleOptions,
+    options: BundleOptions, marks: Array | None = None,
 ) -> Adjusted:  # fmt: skip
     """Estimate the corrections of all views but the first from the tree that all show.
 
@@ -58,13 +60,15 @@ def adjust(
     told : V C-arms without corrections, of the views' sizes
     theta : (V, 5) corrections that the tree was made with, the first of them zero
     options : BundleOptions
+    marks : (m, V, 2) landmarks, (col, row), nan where not seen: rays of one point must meet
     """
     points = _sampled(tree, options.spacing_mm)
     lines = [_Lines.of(view) for view in views]
     if len(points) < options.least_points or not all(line.any for line in lines):
         return Adjusted(theta, 0.0, 0.0)
-    kept, before = _settled(points, lines, told, theta, options, poses=False)
-    found, after = _settled(points, lines, told, theta, options, poses=True)
+    pixels = np.empty((0, len(told), 2)) if marks is None else marks
+    kept, before = _settled(points, lines, told, theta, pixels, options, poses=False)
+    found, after = _settled(points, lines, told, theta, pixels, options, poses=True)
     return Adjusted(found, before, after) if after < before else Adjusted(kept, before, before)
 
 
@@ -111,20 +115,20 @@ def _sampled(tree: Tree, spacing_mm: float) -> Points:
 
 
 def _settled(
-    points: Points, lines: Sequence[_Lines], told: Sequence[CArm], theta: Array,
+    points: Points, lines: Sequence[_Lines], told: Sequence[CArm], theta: Array, marks: Array,
     options: BundleOptions, *, poses: bool,
 ) -> tuple[Array, float]:  # fmt: skip
     """Corrections and mean distance after the steps; ``poses`` False moves the points alone."""
     theta, points = theta.copy(), points.copy()
     reach = options.reach_mm
     for _ in range(options.steps):
-        gap, weight, by_point, by_pose = _linearised(points, lines, told, theta, reach)
-        move, turn = _step(gap, weight, by_point, by_pose, theta, options)
+        parts = _linearised(points, lines, told, theta, reach)
+        move, turn = _step(*parts, theta, _marked(told, theta, marks, options), options)
         points = points + move
         if poses:
             theta[1:] += turn
         reach = max(options.near_mm, 0.8 * reach)
-    gap, weight, _, _ = _linearised(points, lines, told, theta, reach)
+    gap = _linearised(points, lines, told, theta, reach)[0]
     return theta, float(np.minimum(np.abs(gap), reach).mean())
 
 
@@ -178,9 +182,33 @@ def _prior(theta: Array, options: BundleOptions) -> Array:
     return np.hstack([offset] * 3 + [turn] * 2)
 
 
+def _marked(
+    told: Sequence[CArm], theta: Array, marks: Array, options: BundleOptions
+) -> tuple[Scalars, Array]:
+    """(r,) gaps between the rays of landmarks and (r, V - 1, 5) their change, standardised."""
+    pairs = list(itertools.combinations(range(len(told)), 2))
+    seen = [np.isfinite(marks[:, pair]).all(axis=(1, 2)) for pair in pairs]
+
+    def gaps(at: Array) -> Scalars:
+        now = [corrected(carm, t) for carm, t in zip(told, at, strict=True)]
+        parts = [
+            ray_gaps(now[i], now[j], marks[ok, i], marks[ok, j])
+            for (i, j), ok in zip(pairs, seen, strict=True)
+        ]
+        return np.concatenate(parts) / options.landmark_sigma_mm
+
+    here = gaps(theta)
+    change = np.zeros((len(here), len(theta) - 1, 5))
+    for k, part in np.ndindex(change.shape[1:]) if len(here) else ():
+        moved = theta.copy()
+        moved[k + 1, part] += _TURN_DEG
+        change[:, k, part] = (gaps(moved) - here) / _TURN_DEG
+    return here, change
+
+
 def _step(
     gap: Scalars, weight: Scalars, by_point: Array, by_pose: Array, theta: Array,
-    options: BundleOptions,
+    marked: tuple[Scalars, Array], options: BundleOptions,
 ) -> tuple[Points, Array]:  # fmt: skip
     """Gauss-Newton step of (n, 3) points and (V - 1, 5) corrections, the points eliminated."""
     count, prior = len(theta) - 1, _prior(theta, options)
@@ -195,7 +223,9 @@ def _step(
     whole = -np.einsum("nkia,nij,nljb->kalb", B, inverse, B)
     for k in range(count):
         whole[k, :, k] += A[k] + np.diag(prior[k])
+    whole += np.einsum("rka,rlb->kalb", marked[1], marked[1])
     right = b - np.einsum("nkia,nij,nj->ka", B, inverse, g)
+    right += np.einsum("r,rka->ka", marked[0], marked[1])
     turn = -np.linalg.solve(whole.reshape(5 * count, -1), right.ravel()).reshape(count, 5)
     moved = g + np.einsum("nkia,ka->ni", B, turn)
     return -np.einsum("nij,nj->ni", inverse, moved), turn

@@ -118,6 +118,20 @@ def test_gaps_in_the_pictures_do_no_harm():
     assert miss_mm(told, found.theta, points) < 0.6
 
 
+def test_landmarks_hold_where_the_lines_say_little():
+    told, views, points = scene(3, 4)
+    theta = off_by(3, 3.0)
+    marks = np.stack([np.concatenate(points)[::60]] * 3, axis=1)
+    seen = [view.moved(shift) for view, shift in zip(told, MOVED, strict=False)]
+    pixels = np.stack([v.project(marks[:, k])[0] for k, v in enumerate(seen)], axis=1)
+    pixels[0, 1] = np.nan  # one point that one view does not show
+    faint = dataclasses.replace(OPTIONS, line_sigma_mm=50.0)
+    tree = wrong_tree(told, theta, points)
+    alone = adjust(tree, views, told, theta, faint)
+    held = adjust(tree, views, told, theta, faint, pixels)
+    assert miss_mm(told, held.theta, points) < 0.2 * miss_mm(told, alone.theta, points)
+
+
 def test_too_little_to_go_by():
     told, views, points = scene(3, 4)
     theta = off_by(3, 3.0)
