@@ -35,13 +35,16 @@ def bundled(
 
     Returns
     -------
-    V poses: as given with fewer than three views, where no view had to be moved, or where the
+    V poses: as given with fewer than three views, where no view had to be moved, where all
+    pictures are calibrated (their profiles place them more exactly than lines do), or where the
     adjustment does not bring the tree clearly nearer to the pictures
     """
     o = options.bundle
     told = [view.carm for view in views]
     poses = tuple(poses)
-    if len(views) < 3 or not options.pose.enabled or not any(p.theta.any() for p in poses):
+    if len(views) < 3 or not options.pose.enabled or all(view.calibrated for view in views):
+        return poses
+    if not any(pose.theta.any() for pose in poses):
         return poses
     marks = landmark_pixels(options.landmarks, told)
     for _ in range(o.rounds):

@@ -249,11 +249,13 @@ def poses_between(
 
     With ``known`` corrections nothing is estimated, only what the profiles say of them.
     """
-    # Profiles finer than a pixel are sampling noise.
+    # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
     pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    calibrated = [view.calibrated for view in views]
+    finest = max(pixel, options.predict.min_cell_mm) if all(calibrated) else 0.75 * pixel
     pose = dataclasses.replace(
         options.pose,
-        fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
+        fine_mm=max(options.pose.fine_mm, finest),
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
     small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
@@ -262,8 +264,8 @@ def poses_between(
         scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
         marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
     if known is not None:
-        return judged_poses(known, small, pose, marks)
-    return estimate_poses(small, pose, marks)
+        return judged_poses(known, small, pose, marks, calibrated)
+    return estimate_poses(small, pose, marks, calibrated)
 
 
 def _bundled(

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "gcar_deploy"
 #: lower numbers never import higher ones; rooms on one floor keep apart unless listed below
 FLOORS = {
-    "pose_options": -1, "errors": 0, "types": 0, "config": 0, "files": 0, "stopwatch": 1,
+    "errors": 0, "types": 0, "config": 0, "files": 0, "stopwatch": 1,
     "geometry": 1,
     "imaging": 2, "gaussians": 2,
     "tree": 3, "dicom": 3,

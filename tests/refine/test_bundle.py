@@ -43,8 +43,8 @@ def scene(count, seed):
         mask = path > 0.1
         views.append(
             VesselImage(
-                view_id="1", carm=told, path_mm=path, calibrated=True, mask=mask,
-                skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="path_length",
+                view_id="1", carm=told, path_mm=path, calibrated=False, mask=mask,
+                skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="raw",
             )
         )  # fmt: skip
     return list(TOLD[:count]), views, [v.points_mm for v in vessels.vessels]
@@ -159,5 +159,7 @@ def test_rounds_of_tree_and_poses():
         raise AssertionError("a tree is made for nothing")
 
     assert bundled(views[:2], first[:2], never, RunOptions()) == first[:2]
-    still = (Pose(), Pose(), Pose())
+    exact = [dataclasses.replace(view, calibrated=True) for view in views]
+    assert bundled(exact, first, never, RunOptions()) == first
+    still = (Pose(),) * 4
     assert bundled(views, still, never, RunOptions()) == still
