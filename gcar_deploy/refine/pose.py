@@ -133,6 +133,25 @@ def estimate_poses(
     )
 
 
+def judged_poses(
+    poses: Sequence[Pose], views: Sequence[tuple[CArm, Image]], options: PoseOptions,
+    marks: Array, calibrated: Sequence[bool],
+) -> tuple[Pose, ...]:  # fmt: skip
+    """Return the same corrections with what profiles and landmarks say of them.
+
+    Parameters
+    ----------
+    poses : V corrections with their partners
+    views, options, calibrated : as for ``estimate_poses``
+    marks : (m, V, 2) landmarks, (col, row), nan where not seen
+    """
+    masses = [vessel_mass(*view, known) for view, known in zip(views, calibrated, strict=True)]
+    theta = np.stack([pose.theta for pose in poses])
+    return tuple(
+        _joint(k, theta, pose.partner, masses, options, marks) for k, pose in enumerate(poses)
+    )
+
+
 def _joint(
     k: int, theta: Array, partner: int, masses: Sequence[Mass | None], options: PoseOptions,
     marks: Array,
