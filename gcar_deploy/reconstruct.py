@@ -242,11 +242,13 @@ def agreeing(
 
 def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Pose, ...]:
     """Estimate the correction of every view against the first from their vessel profiles."""
-    # Profiles finer than a pixel are sampling noise.
+    # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
     pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    calibrated = [view.calibrated for view in views]
+    finest = max(pixel, options.predict.min_cell_mm) if all(calibrated) else 0.75 * pixel
     pose = dataclasses.replace(
         options.pose,
-        fine_mm=max(options.pose.fine_mm, 0.75 * pixel),
+        fine_mm=max(options.pose.fine_mm, finest),
         coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
     )
     small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
@@ -254,7 +256,7 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
     for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
         scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
         marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
-    return estimate_poses(small, pose, marks)
+    return estimate_poses(small, pose, marks, calibrated)
 
 
 def _posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -1,4 +1,8 @@
-"""Do two pictures show the same tree? The vessel mass of every epipolar plane must agree."""
+"""Do two pictures show the same tree? The vessel mass of every epipolar plane must agree.
+
+Weighted as ``plane_slices`` says, the agreement is exact for path lengths, cone beam and all: what
+differs is the geometry, the pixels, or the tree.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.epipolar import plane_angles
+from gcar_deploy.geometry.epipolar import plane_angles, plane_slices
 from gcar_deploy.types import Array, Image, Pixels, Scalars
 
 #: bins of a profile: width at the isocentre, and how many to each side of it
@@ -18,33 +22,36 @@ HALF_BINS = 600
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mass:
-    """Vessel pixels of one view with their share of the view's mass.
+    """Vessel pixels of one view.
 
     Attributes
     ----------
     carm : CArm
     pixels : (n, 2) (col, row)
-    share : (n,) sums to 1
+    path : (n,) path length, mm where ``calibrated``, else in any scale
+    calibrated : bool
     """
 
     carm: CArm
     pixels: Pixels
-    share: Scalars
+    path: Scalars
+    calibrated: bool = False
 
 
-def vessel_mass(carm: CArm, path_mm: Image) -> Mass | None:
+def vessel_mass(carm: CArm, path_mm: Image, calibrated: bool = False) -> Mass | None:
     """Collect the pixels with vessel; None where there is none.
 
     Parameters
     ----------
     carm : CArm of the picture's size
-    path_mm : (rows, cols) path length, any scale, zero outside vessels
+    path_mm : (rows, cols) path length, zero outside vessels; any scale unless ``calibrated``
+    calibrated : bool
     """
     rows, cols = np.nonzero(path_mm > 0)
     if len(rows) == 0:
         return None
-    mass = path_mm[rows, cols].astype(np.float64)
-    return Mass(carm, np.column_stack([cols, rows]).astype(np.float64), mass / mass.sum())
+    pixels = np.column_stack([cols, rows]).astype(np.float64)
+    return Mass(carm, pixels, path_mm[rows, cols].astype(np.float64), calibrated)
 
 
 def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tuple[Array, Array]:
@@ -58,19 +65,24 @@ def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tup
 
     Returns
     -------
-    two (2 HALF_BINS + 1,) arrays, each summing to 1 unless vessel lies outside all bins
+    two (2 HALF_BINS + 1,) arrays, each summing to 1; on average where both are calibrated
     """
     reach = 0.5 * float(np.linalg.norm(fixed.carm.source_mm) + np.linalg.norm(carm.source_mm))
-    out = []
+    out, sums = [], []
     for mass, view in ((fixed, fixed.carm), (moving, carm)):
-        at = plane_angles(fixed.carm, carm, view, mass.pixels) * reach / BIN_MM + HALF_BINS
+        angle, weight = plane_slices(fixed.carm, carm, view, mass.pixels)
+        at = angle * reach / BIN_MM + HALF_BINS
         low = np.clip(np.floor(at).astype(np.int64), 0, 2 * HALF_BINS - 1)
         part = np.clip(at - low, 0.0, 1.0)
         n = 2 * HALF_BINS + 1
-        profile = np.bincount(low, mass.share * (1 - part), n)
-        profile += np.bincount(low + 1, mass.share * part, n)
+        value = mass.path * weight
+        profile = np.bincount(low, value * (1 - part), n)
+        profile += np.bincount(low + 1, value * part, n)
         out.append(gaussian_filter1d(profile, sigma_mm / BIN_MM, mode="constant"))
-    return out[0], out[1]
+        sums.append(float(value.sum()))
+    if fixed.calibrated and moving.calibrated:
+        sums = [0.5 * (sums[0] + sums[1])] * 2
+    return out[0] / sums[0], out[1] / sums[1]
 
 
 def match_rate(first: CArm, second: CArm, a: Pixels, b: Pixels, near_mm: float) -> float | None:
@@ -103,3 +115,9 @@ def disagreement(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> floa
     """Half the summed difference of both profiles: 0 (equal) .. 1 (nothing in common)."""
     a, b = mass_profiles(fixed, moving, carm, sigma_mm)
     return float(0.5 * np.abs(a - b).sum())
+
+
+def mismatch(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> float:
+    """Root mean square difference of both profiles, as a share of the first's."""
+    a, b = mass_profiles(fixed, moving, carm, sigma_mm)
+    return float(np.sqrt(((a - b) @ (a - b)) / (a @ a)))

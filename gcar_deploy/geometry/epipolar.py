@@ -81,10 +81,35 @@ def ray_gaps(first: CArm, second: CArm, a: Pixels, b: Pixels) -> Scalars:
 
 
 def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scalars:
-    """Angle of the epipolar plane through each (n, 2) pixel of ``carm``, radians.
+    """Angle of the epipolar plane through each (n, 2) pixel of ``carm``, radians (n,).
+
+    See ``plane_slices``.
+    """
+    return plane_slices(first, second, carm, pixels)[0]
+
+
+def plane_slices(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> tuple[Scalars, Scalars]:
+    """Epipolar plane of each pixel of ``carm``, and what its path length counts for there.
 
     Planes of the pair (first, second) turn about the line through both sources; zero is the
-    plane through the isocentre. ``carm`` is one of the pair.
+    plane through the isocentre. ``carm`` is one of the pair. Within one plane, with theta the
+    angle between a ray and that line, and q the distance from it,
+
+        integral of path(theta) / sin(theta) d theta = integral of density / q over the plane,
+
+    which is the same for both sources (fan-beam consistency). A pixel of solid angle
+    d Omega = sin(theta) d theta d kappa therefore counts with d Omega / sin(theta)^2, and sums
+    over the pixels between two planes are exactly equal in both views, whatever is looked at.
+
+    Parameters
+    ----------
+    first, second, carm : CArm
+    pixels : (n, 2) (col, row)
+
+    Returns
+    -------
+    angle : (n,) kappa, radians
+    weight : (n,) d Omega / sin(theta)^2, radians squared
 
     Raises
     ------
@@ -103,13 +128,16 @@ def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scala
         raise GeometryError("the views face each other exactly: no plane through the isocentre")
     e1 = towards / distance
     e2 = np.cross(base, e1)
-    # A pixel's ray is M^-1 (col, row, 1) but for its length, which the angle does not ask for.
-    across, ahead = np.linalg.solve(carm.world2pixel[:, :3].T, np.stack([e2, e1], axis=1)).T
-    pixels = np.asarray(pixels, dtype=np.float64)
-    return np.arctan2(
-        pixels @ across[:2] + across[2],
-        pixels @ ahead[:2] + ahead[2],
-    )
+    # A pixel's ray is M^-1 (col, row, 1), of unit depth; its share along three axes.
+    M = carm.world2pixel[:, :3]
+    axes = np.linalg.solve(M.T, np.stack([e2, e1, base], axis=1))
+    rays = np.asarray(pixels, dtype=np.float64) @ axes[:2] + axes[2]
+    across, ahead, along = rays.T
+    from_base = across * across + ahead * ahead
+    # d Omega is the pixel's area at unit depth (1 / |det M|) over the ray's length cubed, and
+    # sin(theta) is its distance from the line over its length.
+    weight = 1.0 / (abs(np.linalg.det(M)) * from_base * np.sqrt(from_base + along * along))
+    return np.arctan2(across, ahead), weight
 
 
 def plane_normal(first: CArm, second: CArm) -> Array:

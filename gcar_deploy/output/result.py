@@ -14,8 +14,9 @@ import numpy as np
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.geometry.observability import silent_errors
+from gcar_deploy.geometry.observability import EXACT_DISAGREEMENT, silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
@@ -81,10 +82,21 @@ class Result:
         """``ok`` or ``degraded``."""
         return self.quality.status
 
+    @property
+    def _carms(self) -> list[CArm]:
+        return [view.carm for view in self.views]
+
+    @property
+    def _exact(self) -> bool:
+        """Calibrated pictures whose vessel mass leaves no room for an angle error."""
+        after = self.quality.disagreement
+        calibrated = all(view.calibrated for view in self.views)
+        return calibrated and after is not None and after <= EXACT_DISAGREEMENT
+
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
         reasons: dict[str, str] = {}
-        further = best_further_view(self.tree, [view.carm for view in self.views])
+        further = best_further_view(self.tree, self._carms)
         body = {
             "schema": SCHEMA,
             "status": self.quality.status,
@@ -94,7 +106,7 @@ class Result:
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],
-            "silent_errors": list(silent_errors([view.carm for view in self.views])),
+            "silent_errors": list(silent_errors(self._carms, exact=self._exact)),
             "tree": {
                 "length_mm": self.tree.length_mm,
                 "branches": [

@@ -14,16 +14,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import minimize
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
-from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles
+from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
+from gcar_deploy.refine.profile_fit import fit_profiles
 from gcar_deploy.types import Array, Scalars
-
-#: relative change of the objective or of the pose below which a fit ends
-TOLERANCE = 1e-4
 
 
 def corrected(carm: CArm, theta: Array) -> CArm:
@@ -94,24 +92,30 @@ class _Problem:
         return fixed, b, corrected(b.carm, theta[j])
 
     def differences(self, i: int, j: int, theta: Array, sigma_mm: float) -> Scalars:
-        """Profile of one view minus that of the other, in units of its usual error."""
+        """Profile of one view minus that of the other, as shares of its norm."""
         fixed, moving, carm = self.pair(i, j, theta)
         a, b = mass_profiles(fixed, moving, carm, sigma_mm)
-        out: Scalars = (a - b) / (self.options.profile_noise * np.sqrt(float(a @ a)))
+        out: Scalars = (a - b) / np.sqrt(float(a @ a))
         return out
 
-    def residuals(self, x: Array, sigma_mm: float) -> Scalars:
+    def residuals(self, x: Array, sigma_mm: float, noise: float) -> Scalars:
         """All differences, landmark gaps and corrections over their standard deviations."""
-        theta = np.vstack([np.zeros(5), x.reshape(-1, 5)])
+        theta = _with_first(x)
         parts = [(theta[1:] / self.prior).ravel()]
         for i, j in self.pairs:
-            parts.append(self.differences(i, j, theta, sigma_mm))
+            parts.append(self.differences(i, j, theta, sigma_mm) / noise)
             seen = self.marks[np.isfinite(self.marks[:, [i, j]]).all(axis=(1, 2))]
             if len(seen):
                 fixed, _, carm = self.pair(i, j, theta)
                 gaps = ray_gaps(fixed.carm, carm, seen[:, i], seen[:, j])
                 parts.append(gaps / self.options.landmark_sigma_mm)
         return np.concatenate(parts)
+
+    def left(self, x: Array, sigma_mm: float) -> float:
+        """Root mean square mismatch over the pairs."""
+        theta = _with_first(x)
+        values = [mismatch(*self.pair(*p, theta), sigma_mm) for p in self.pairs]
+        return float(np.sqrt(np.mean(np.square(values))))
 
     def disagreements(self, theta: Array, view: int | None = None) -> list[float]:
         """Of every pair, or of those of one view, 0 (equal) .. 1 (disjoint)."""
@@ -140,7 +144,8 @@ class _Problem:
             for step in steps:
                 at = zero.copy()
                 at[j, :3] = step * normal
-                misfit.append(float(np.sum(self.differences(i, j, at, o.coarse_mm) ** 2)))
+                apart = self.differences(i, j, at, o.coarse_mm) / o.profile_noise
+                misfit.append(float(np.sum(apart**2)))
             curves.append((i, j, normal, CubicSpline(steps, misfit, bc_type="clamped")))
 
         def cost(x: Array) -> tuple[float, Array]:
@@ -165,13 +170,13 @@ class _Problem:
 
     def fitted(self, theta: Array) -> Array:
         """(V, 5) offsets and angles together, from coarse to fine profiles."""
-        x, prior = theta[1:].ravel(), np.tile(self.prior, len(theta) - 1)
-        for sigma in (self.options.coarse_mm, self.options.fine_mm):
-            x = least_squares(
-                self.residuals, x, args=(sigma,), diff_step=1e-3, x_scale=prior,
-                ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=self.options.max_evaluations,
-            ).x  # fmt: skip
-        return np.vstack([np.zeros(5), x.reshape(-1, 5)])
+        prior = np.tile(self.prior, len(theta) - 1)
+        calibrated = all(mass.calibrated for mass in self.seen.values())
+        x = fit_profiles(
+            self.residuals, self.left, theta[1:].ravel(), prior, self.options,
+            calibrated=calibrated,
+        )  # fmt: skip
+        return _with_first(x)
 
     def without_the_needless(self, theta: Array) -> Array:
         """Leave a view alone whose correction does not clearly help it to agree."""
@@ -182,3 +187,8 @@ class _Problem:
             if self.mean_disagreement(theta, k) > self.options.min_gain * alone:
                 theta = less
         return theta
+
+
+def _with_first(x: Array) -> Array:
+    """(V, 5) corrections from the unknowns: the first view stays."""
+    return np.vstack([np.zeros(5), x.reshape(-1, 5)])

@@ -2,9 +2,10 @@
 
 Every plane through both sources cuts the same slice of vessel out of both pictures, so the
 vessel mass per plane must agree. A patient who moved between the runs, or an angle that was
-read off wrongly, shifts one profile against the other; the shift that makes them agree again
-is what the pictures can tell. What they cannot tell (motion within the planes) is held at zero
-by its prior.
+read off wrongly, makes the profiles differ; the correction that makes them agree again is what
+the pictures can tell. What they cannot tell is held at zero by its prior: in raw pictures all
+motion within the planes, in calibrated ones, whose cone-beam profiles agree to a part in a
+thousand, no more than the direction of the line through both sources.
 """
 
 from __future__ import annotations
@@ -13,13 +14,19 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
-from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
+from gcar_deploy.geometry.consistency import (
+    Mass,
+    disagreement,
+    mass_profiles,
+    mismatch,
+    vessel_mass,
+)
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
-from gcar_deploy.refine.joint_pose import TOLERANCE, corrected, estimate_jointly
+from gcar_deploy.refine.joint_pose import corrected, estimate_jointly
+from gcar_deploy.refine.profile_fit import fit_profiles
 from gcar_deploy.types import Array, Image, Pixels
 
 
@@ -69,7 +76,10 @@ class Pose:
 
 
 def estimate_poses(
-    views: Sequence[tuple[CArm, Image]], options: PoseOptions, landmarks: Array | None = None
+    views: Sequence[tuple[CArm, Image]],
+    options: PoseOptions,
+    landmarks: Array | None = None,
+    calibrated: Sequence[bool] | None = None,
 ) -> tuple[Pose, ...]:
     """Estimate the correction of every view against the first, directly or through others.
 
@@ -83,15 +93,18 @@ def estimate_poses(
     views : sequence of (CArm, path_mm)
         Path lengths in any scale, zero outside vessels; some 128^2 pixels are enough.
     options : PoseOptions
+        ``fine_mm`` at least the pixel at the isocentre, or calibrated profiles differ by pixels.
     landmarks : (m, V, 2) (col, row) of points marked in the views as they are here, nan where
         not seen; the rays of one point must meet
+    calibrated : per view, whether the path lengths are in mm; none where left out
 
     Returns
     -------
     tuple of Pose, the first of them zero
     """
     marks = np.empty((0, len(views), 2)) if landmarks is None else landmarks
-    masses = [vessel_mass(carm, path) for carm, path in views]
+    exact = [False] * len(views) if calibrated is None else calibrated
+    masses = [vessel_mass(*view, known) for view, known in zip(views, exact, strict=True)]
     poses = {0: Pose()}
     while len(poses) < len(views):
         left = [k for k in range(len(views)) if k not in poses]
@@ -151,28 +164,31 @@ def _estimate(
     before = disagreement(fixed, moving, moving.carm, options.fine_mm)
     gap = _gap_mm(fixed.carm, moving.carm, marks)
     given = Pose(before=before, after=before, landmark_before_mm=gap, landmark_after_mm=gap)
-    if not options.enabled:
+    calibrated = fixed.calibrated and moving.calibrated
+    apart = mismatch(fixed, moving, moving.carm, options.fine_mm)
+    if not options.enabled or (calibrated and gap is None and apart <= options.agreed_calibrated):
         return given
     prior = np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+
+    def residuals(theta: Array, sigma_mm: float, noise: float) -> Array:
+        carm = corrected(moving.carm, theta)
+        a, b = mass_profiles(fixed, moving, carm, sigma_mm)
+        gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
+        return np.concatenate([(a - b) / (noise * np.sqrt(float(a @ a))), theta / prior, gaps])
+
+    def left(theta: Array, sigma_mm: float) -> float:
+        return mismatch(fixed, moving, corrected(moving.carm, theta), sigma_mm)
+
     normal = plane_normal(fixed.carm, moving.carm)
     start, best = np.zeros(5), np.inf
-    for shift in np.arange(-options.search_mm, options.search_mm + 1e-9, options.step_mm):
+    near = calibrated and apart <= options.profile_noise
+    reach = 0.0 if near else options.search_mm
+    for shift in np.arange(-reach, reach + 1e-9, options.step_mm):
         theta = np.concatenate([shift * normal, np.zeros(2)])
-        r = _residuals(theta, fixed, moving, prior, options.coarse_mm, options, marks)
+        r = residuals(theta, options.coarse_mm, options.profile_noise)
         if float(r @ r) < best:
             start, best = theta, float(r @ r)
-    for sigma in (options.coarse_mm, options.fine_mm):
-        solution = least_squares(
-            _residuals,
-            start,
-            args=(fixed, moving, prior, sigma, options, marks),
-            diff_step=1e-3,
-            x_scale=prior,
-            ftol=TOLERANCE,
-            xtol=TOLERANCE,
-            max_nfev=options.max_evaluations,
-        )
-        start = solution.x
+    start = fit_profiles(residuals, left, start, prior, options, calibrated=calibrated)
     carm = corrected(moving.carm, start)
     after, gap_after = (
         disagreement(fixed, moving, carm, options.fine_mm),
@@ -193,17 +209,6 @@ def _estimate(
         landmark_before_mm=gap,
         landmark_after_mm=gap_after,
     )
-
-
-def _residuals(
-    theta: Array, fixed: Mass, moving: Mass, prior: Array, sigma_mm: float, options: PoseOptions,
-    marks: tuple[Pixels, Pixels],
-) -> Array:  # fmt: skip
-    carm = corrected(moving.carm, theta)
-    a, b = mass_profiles(fixed, moving, carm, sigma_mm)
-    scale = 1.0 / (options.profile_noise * np.sqrt(float(a @ a)))
-    gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
-    return np.concatenate([(a - b) * scale, theta / prior, gaps])
 
 
 def _gap_mm(first: CArm, second: CArm, marks: tuple[Pixels, Pixels]) -> float | None:

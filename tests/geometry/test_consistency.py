@@ -10,6 +10,7 @@ from gcar_deploy.geometry.consistency import (
     disagreement,
     mass_profiles,
     match_rate,
+    mismatch,
     vessel_mass,
 )
 from gcar_deploy.geometry.epipolar import plane_angles, plane_normal
@@ -56,7 +57,27 @@ def masses(first, second):
 def test_one_tree_agrees_and_two_do_not():
     same = disagreement(*masses(blobs(0), blobs(0)), PAIR[1], sigma_mm=0.5)
     other = disagreement(*masses(blobs(0), blobs(1)), PAIR[1], sigma_mm=0.5)
-    assert same < 0.03 and other > 0.3
+    assert same < 0.002 and other > 0.3
+
+
+def test_depth_does_not_change_what_a_vessel_counts_for():
+    """Balls near to one source and far from the other: only the exact weights make them equal."""
+    towards = PAIR[0].axes[2]
+    points = np.random.default_rng(5).normal(scale=8, size=(12, 3)) + 60 * towards
+    first, second = (vessel_mass(c, picture(c, points), calibrated=True) for c in PAIR)
+    a, b = mass_profiles(first, second, PAIR[1], 1.0)
+    assert a.sum() == pytest.approx(b.sum(), rel=5e-3)
+    assert mismatch(first, second, PAIR[1], 1.0) < 0.004
+    plain = [float(m.path.sum() / m.carm.focal_px[0] ** 2) for m in (first, second)]
+    assert abs(plain[0] / plain[1] - 1) > 0.05  # solid angle alone would not do
+
+
+def test_an_angle_error_shows_in_exact_profiles():
+    """A degree in the angle between the views leaves every point its rays, but not its mass."""
+    points = blobs(2)
+    first, second = (vessel_mass(c, picture(c, points), calibrated=True) for c in PAIR)
+    told = [mismatch(first, second, PAIR[1].turned(d), 1.0) for d in (-1, 0, 1)]
+    assert told[1] < 0.004 and min(told[0], told[2]) > 3 * told[1]
 
 
 def test_profiles_are_shares_of_the_mass():

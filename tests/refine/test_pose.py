@@ -16,12 +16,12 @@ from tests.predict.test_candidates import carm  # noqa: E402
 TOLD = (carm(-30, -20), carm(45, 25))
 
 
-def pictures(moved=(0.0, 0.0, 0.0), turned=0.0, seed=4):
+def pictures(moved=(0.0, 0.0, 0.0), turned=0.0, seed=4, told=TOLD):
     tree = random_tree(np.random.default_rng(seed)).sides("left").segments()
-    true = TOLD[1].turned(turned).moved(moved)
+    true = told[1].turned(turned).moved(moved)
     return [
-        (TOLD[0], render.path_lengths(TOLD[0], *tree)),
-        (TOLD[1], render.path_lengths(true, *tree)),
+        (told[0], render.path_lengths(told[0], *tree)),
+        (told[1], render.path_lengths(true, *tree)),
     ]
 
 
@@ -52,6 +52,44 @@ def test_shift_with_an_angle_error_as_in_a_room():
     moved = np.array([1.5, -2.0, 3.0])
     pose = estimate_poses(pictures(moved=moved, turned=1.0), PoseOptions())[1]
     assert np.dot(pose.offset_mm, normal) == pytest.approx(moved @ normal, abs=0.6)
+
+
+#: pictures of 0.24 mm, whose rays through the pixels' centres miss little of any vessel
+FINE = tuple(view.resized(512, 512) for view in TOLD)
+SMOOTH = PoseOptions(fine_mm=0.85)
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6])
+@pytest.mark.parametrize("turned", [-2.0, 0.5, 1.0])
+def test_calibrated_pictures_show_the_angle(turned, seed):
+    """All but the move along the line through both sources is found, to a tenth of a degree."""
+    moved = np.array([1.5, -2.0, 3.0])
+    views = pictures(moved=moved, turned=turned, seed=seed, told=FINE)
+    pose = estimate_poses(views, SMOOTH, calibrated=(True, True))[1]
+    assert pose.primary_deg == pytest.approx(turned, abs=0.25)
+    assert abs(pose.secondary_deg) < 0.25
+    found = pose.applied(FINE[1]).source_mm
+    true = FINE[1].turned(turned).moved(moved).source_mm
+    base = (found - TOLD[0].source_mm) / np.linalg.norm(found - TOLD[0].source_mm)
+    beside = (found - true) - (found - true) @ base * base
+    # the source lies 765 mm off: 0.1 deg are 1.3 mm there
+    assert np.linalg.norm(beside) < 4.0
+    assert pose.after < 0.1 * pose.before
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_noise_of_other_causes_makes_the_prior_strong_again(seed):
+    """Calibration that drifts over the picture is not taken for an angle."""
+    (a, b) = pictures(seed=seed, told=FINE)
+    rows = np.linspace(0.85, 1.15, b[1].shape[0])[:, None].astype(np.float32)
+    cols = 1 + 0.1 * np.sin(np.linspace(0, 9, b[1].shape[1]), dtype=np.float32)
+    pose = estimate_poses([a, (b[0], b[1] * rows * cols)], SMOOTH, calibrated=(True, True))[1]
+    assert pose.turn_deg < 0.7 and pose.shift_mm < 2.0
+
+
+def test_exact_pictures_are_left_alone():
+    pose = estimate_poses(pictures(told=FINE), SMOOTH, calibrated=(True, True))[1]
+    assert pose == Pose(before=pose.before, after=pose.before)
 
 
 def landmarks(moved, count):

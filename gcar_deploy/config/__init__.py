@@ -1,0 +1,70 @@
+"""Options of every stage as frozen values; each default is written here and nowhere else."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TypeAlias
+
+from gcar_deploy.config.pictures import (
+    DicomLimits,
+    DicomOptions,
+    ImagingOptions,
+    PictureLimits,
+)
+from gcar_deploy.config.pose import PoseOptions
+from gcar_deploy.config.predict import (
+    CandidateOptions,
+    DecideOptions,
+    ModelLimits,
+    PredictOptions,
+    SingleViewOptions,
+)
+from gcar_deploy.config.quality import QualityOptions
+from gcar_deploy.config.refine import (
+    PaperOptions,
+    RefineOptions,
+    TreeOptions,
+    TubeOptions,
+    VolumeOptions,
+)
+
+__all__ = [
+    "CandidateOptions",
+    "DecideOptions",
+    "DicomLimits",
+    "DicomOptions",
+    "ImagingOptions",
+    "Landmark",
+    "ModelLimits",
+    "PaperOptions",
+    "PictureLimits",
+    "PoseOptions",
+    "PredictOptions",
+    "QualityOptions",
+    "RefineOptions",
+    "RunOptions",
+    "SingleViewOptions",
+    "TreeOptions",
+    "TubeOptions",
+    "VolumeOptions",
+]
+
+#: (col, row) of one point in each view, None where it is not seen
+Landmark: TypeAlias = "tuple[tuple[float, float] | None, ...]"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Everything ``reconstruct`` needs to know beside pictures and geometry."""
+
+    dicom: DicomOptions = dataclasses.field(default_factory=DicomOptions)
+    imaging: ImagingOptions = dataclasses.field(default_factory=ImagingOptions)
+    pose: PoseOptions = dataclasses.field(default_factory=PoseOptions)
+    candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)
+    predict: PredictOptions = dataclasses.field(default_factory=PredictOptions)
+    decide: DecideOptions = dataclasses.field(default_factory=DecideOptions)
+    tree: TreeOptions = dataclasses.field(default_factory=TreeOptions)
+    refine: RefineOptions = dataclasses.field(default_factory=RefineOptions)
+    quality: QualityOptions = dataclasses.field(default_factory=QualityOptions)
+    #: points marked in the pictures, which hold the views to each other
+    landmarks: tuple[Landmark, ...] = ()

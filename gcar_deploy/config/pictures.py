@@ -1,0 +1,102 @@
+"""Options from a picture or DICOM run to vessels and path lengths."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PictureLimits:
+    """What a picture file may be before any decoder sees it."""
+
+    max_bytes: int = 32 * 2**20
+    #: pixels; each side of the picture
+    min_side: int = 16
+    max_side: int = 4096
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DicomLimits:
+    """What a DICOM run may be before any of its pixels is decoded."""
+
+    max_bytes: int = 512 * 2**20
+    #: pixels; each side of a frame
+    min_side: int = 16
+    max_side: int = 4096
+    max_frames: int = 2000
+    #: of all frames together
+    max_pixels: int = 2**30
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DicomOptions:
+    """From a DICOM run to one picture with its geometry."""
+
+    limits: DicomLimits = dataclasses.field(default_factory=DicomLimits)
+    #: frame of each run, counted from 1, None to choose; one entry holds for all runs
+    frames: tuple[int | None, ...] = (None,)
+    #: for files that do not say it: pixel spacing at the detector, source to isocentre, mm
+    pixel_spacing_mm: float | None = None
+    sod_mm: float | None = None
+    #: frames filled to this share of the best are compared by their stillness
+    filled_share: float = 0.9
+    #: a frame named by the file but filled less than this share of the best is worth a word
+    least_filled_share: float = 0.5
+    #: tilt of the detector against the beam: said above the first, refused above the second
+    good_tilt_deg: float = 0.1
+    max_tilt_deg: float = 1.0
+    #: share by which SDD / SOD may differ from the file's own magnification factor
+    magnification_share: float = 0.02
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImagingOptions:
+    """From a picture to vessel mask, skeleton and path length. Millimetres at the isocentre."""
+
+    limits: PictureLimits = dataclasses.field(default_factory=PictureLimits)
+    #: who finds vessels in grey values: ``classic``, ``net``, or ``auto`` (the network is asked
+    #: where the classical method finds none)
+    segmenter: str = "classic"
+    #: hysteresis on the network's probability
+    net_low: float = 0.4
+    net_high: float = 0.7
+    #: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's
+    #: edge p. A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns
+    #: in the sampling of the picture itself.
+    path_threshold_pixels: float = 0.1
+    #: vessels are looked for at this pixel size (coarser pictures keep their own)
+    work_pixel_mm: float = 0.5
+    #: Gaussian widths of the ridge filter: vessel diameters of some 1 to 7 mm
+    ridge_sigma_mm: tuple[float, ...] = (0.75, 1.05, 1.5, 2.1)
+    #: the ridge must stand above both sides at this many sigma (a step edge has only one)
+    side_gap_sigmas: float = 2.5
+    #: response times sigma^power: below 0 a narrow explanation wins over a wide one
+    scale_power: float = -0.5
+    #: what varies more slowly than this is background to the ridge filter
+    flatten_sigma_mm: float = 10.0
+    #: grey level, as a share of the white level, added before the logarithm
+    log_offset: float = 0.08
+    #: hysteresis, as shares of the 99th percentile of the response
+    low_share: float = 0.3
+    high_share: float = 0.6
+    #: connected parts with less than this share of the strongest part's summed response go
+    part_share: float = 0.08
+    #: a side branch shorter than this is a spur; an end weaker than this share goes as well
+    spur_mm: float = 7.5
+    weak_share: float = 0.4
+    #: a straight line as long as this share of the shorter side is a wire or an edge
+    straight_share: float = 0.6
+    #: rim of the mask: this many noise deviations, but within these shares of the peak
+    rim_noise: float = 9.0
+    rim_low: float = 0.15
+    rim_high: float = 0.65
+    #: farthest rim, in units of the ridge filter's sigma
+    reach_sigmas: float = 1.6
+    #: filled-in background: margin left round the vessels, and width of the fill
+    margin_mm: float = 1.0
+    fill_sigma_mm: float = 2.5
+    #: less skeleton than this, or a weaker peak in noise deviations, is no vessel
+    min_length_mm: float = 25.0
+    min_contrast: float = 6.0
+    #: and the peak, as a share of the white level, must be seen at all
+    min_peak: float = 0.03

@@ -1,0 +1,46 @@
+"""Options of the pose between the views."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """Table or breath shift and angle error between views, from epipolar consistency."""
+
+    enabled: bool = True
+    #: priors, one standard deviation: how far a patient moves between runs, how well angles are
+    #: read; a direction the pictures say nothing about stays at zero
+    offset_sigma_mm: float = 3.0
+    angle_sigma_deg: float = 0.7
+    #: first search along the direction that two views see best, mm
+    search_mm: float = 12.0
+    step_mm: float = 1.0
+    #: smoothing of the mass profiles, mm at the isocentre
+    coarse_mm: float = 1.5
+    fine_mm: float = 0.5
+    #: how well two profiles of the same tree agree, as a share of their norm
+    profile_noise: float = 0.05
+    #: the same for calibrated pictures: tried one after the other, as long as what is left of the
+    #: difference is at most so many times as much (see ``profile_fit``)
+    calibrated_noises: tuple[float, ...] = (0.015, 0.005, 0.002)
+    most_left: float = 1.5
+    #: calibrated pictures that agree so well as they are told are left alone: pixels, not poses
+    agreed_calibrated: float = 0.002
+    #: directions further apart than this are not compared: see ``estimate_poses``
+    most_apart_deg: float = 150.0
+    #: three and more views: directions nearer than this tell nothing of each other; and from how
+    #: many starts their offsets are sought together
+    least_apart_deg: float = 10.0
+    joint_starts: int = 60
+    #: more views than this are corrected pair by pair alone; pairs that disagree by no more than
+    #: this as they are told, are left alone (four views of one tree, exactly placed, pixels of
+    #: 1.4 mm: up to 0.08)
+    joint_most_views: int = 4
+    agreed: float = 0.09
+    #: how well a person marks the same point in two views, mm at the isocentre
+    landmark_sigma_mm: float = 0.5
+    #: a correction must lower the disagreement to this share of what it was
+    min_gain: float = 0.85
+    max_evaluations: int = 40

@@ -1,0 +1,45 @@
+"""Gates between ``ok``, ``degraded`` and ``refused``."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QualityOptions:
+    """Gates between ``ok``, ``degraded`` and ``refused``."""
+
+    #: best angle between two views, folded to 0 .. 90: depth errors are 1/sin of it times the
+    #: errors in the picture, 11-fold at 5 deg (not worth having), 2.4-fold at 25 deg
+    min_separation_deg: float = 5.0
+    good_separation_deg: float = 25.0
+    #: two views of one tree hold the same vessel mass in every epipolar plane; disagreement of
+    #: the two profiles after the best shift, 0 (equal) .. 1 (disjoint). Nine simulated trees:
+    #: 0.01 to 0.02 between path-length views of one tree, from 0.11 between those of two
+    good_disagreement: float = 0.05
+    max_disagreement: float = 0.09
+    #: the same where vessels had to be found in raw pictures, which adds errors of its own: nine
+    #: simulated raw pairs of one tree lie at 0.06 .. 0.48 and overlap with those of two trees
+    #: (0.14 .. 0.58), so between these figures the finished tree decides: it leaves more than a
+    #: tenth of the vessels of a view unexplained in all nine pairs of two trees, in one of one
+    good_disagreement_raw: float = 0.13
+    max_disagreement_raw: float = 0.6
+    #: above this, nine of ten raw pairs of one tree (up to 0.28) are ruled out, and the largest
+    #: part of each picture is asked alone: what else was found may be background
+    parts_disagreement_raw: float = 0.35
+    #: share of a view's skeleton that the reprojected tree explains
+    good_coverage: float = 0.9
+    min_coverage: float = 0.3
+    #: share of the reprojected tree that lies on the view's vessels: at 0.99 and more
+    #: in 49 generated trees (clinical views, exact and moved) that came out right
+    good_support: float = 0.95
+    min_support: float = 0.3
+    #: how near counts, pixels of the picture, but at least so many mm at the isocentre: half a
+    #: lattice cell is not an error
+    near_px: float = 2.0
+    near_mm: float = 1.0
+    #: a larger estimated correction between the runs is no small matter of breath or table
+    good_shift_mm: float = 5.0
+    good_turn_deg: float = 1.5
+    #: less tree than this is not a coronary tree
+    min_length_mm: float = 20.0
