@@ -33,9 +33,14 @@ WALLED = {
     "torch": {"gaussians/torch_project.py"},
     "onnxruntime": {"predict/center_predictor.py", "imaging/net.py"},
     "nibabel": {"output/volume.py"},
-    "pydicom": {"dicom/header.py", "dicom/frames.py", "output/dicom_stl.py"},
+    "pydicom": {
+        "dicom/header.py",
+        "dicom/frames.py",
+        "output/dicom_stl.py",
+        "output/dicom_study.py",
+    },
     "distributed": {"batch/pools.py"},
-    "pynetdicom": {"worker/listen.py"},
+    "pynetdicom": {"worker/listen.py", "worker/send.py"},
     "flask": {"worker/http.py"},
     "waitress": {"worker/http.py"},
 }

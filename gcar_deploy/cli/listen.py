@@ -33,6 +33,10 @@ from gcar_deploy.cli.common import (
     "--runs", type=click.IntRange(2, 16), default=2, show_default=True,
     help="A study with so many runs is reconstructed.",
 )  # fmt: skip
+@click.option(
+    "--send-to", default=None, metavar="AET@HOST:PORT",
+    help="Send surface and overlays back into the study by C-STORE.",
+)  # fmt: skip
 @click.option("--once", is_flag=True, help="End after the first study.")
 @click.option(
     "--limit", type=click.FloatRange(min=0, min_open=True), default=300.0, show_default=True,
@@ -53,6 +57,7 @@ def listen(
     port: int,
     title: str,
     runs: int,
+    send_to: str | None,
     once: bool,
     limit: float,
     spacing: float | None,
@@ -66,8 +71,10 @@ def listen(
     """Receive angiography runs by DICOM C-STORE and reconstruct each study.
 
     Listens on 127.0.0.1 alone. When a sender lets go and a study has enough runs, its result
-    appears as OUT/STUDY_INSTANCE_UID, and one line of JSON on stdout says so. Ctrl-C or SIGTERM
-    ends it.
+    appears as OUT/STUDY_INSTANCE_UID, and one line of JSON on stdout says so. With --send-to the
+    surface (Encapsulated STL) and the overlays (Secondary Capture) also go to a storage service,
+    as new series of the same study and patient; the folder is kept whatever that service answers.
+    Ctrl-C or SIGTERM ends it.
 
     \b
     Example:
@@ -82,10 +89,12 @@ def listen(
         raise UsageError(f"--title {title!r} must be 1 .. 16 plain characters")
     with needs_extra("listen", "pynetdicom", "pydicom"):
         from gcar_deploy.worker.listen import LOOPBACK, Listener, tell
+        from gcar_deploy.worker.send import parse_peer, sent_back
     from gcar_deploy.engine import Engine
     from gcar_deploy.worker.jobs import Job, JobQueue
     from gcar_deploy.worker.orders import do_order
 
+    peer = None if send_to is None else parse_peer(send_to)
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -103,7 +112,12 @@ def listen(
             over.set()
 
     def work(order: Any, on_progress: Any, cancel: Any) -> Any:
-        return do_order(engine, order, on_progress, cancel, limit_s=limit)
+        summary, folder = do_order(engine, order, on_progress, cancel, limit_s=limit)
+        if peer is not None:
+            summary |= sent_back(folder, order.views[0], peer, title)
+            if summary["send_error"]:
+                click.echo(f"gcar: not sent: {summary['send_error']}", err=True)
+        return summary, folder
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     queue = JobQueue(work, on_change=on_change)

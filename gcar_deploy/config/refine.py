@@ -52,6 +52,12 @@ class TubeOptions:
     taper_pixel_mm: float = 0.85
     #: ... but at most so many times
     most_taper_easing: float = 3.0
+    #: radii refitted with the axes held, on such fine pixels: steps, noise of the path length, mm
+    calibre_steps: int = 3
+    calibre_noise_mm: float = 0.15
+    #: ... and the walk of their log: scale, 1 / sqrt(mm), and Student's degrees of freedom
+    calibre_walk: float = 0.2
+    calibre_freedom: float = 3.0
     #: starting points: standard deviation over 1 mm of centreline, mm
     anchor_mm: float = 1.0
     #: starting radii: standard deviation of the log over 1 mm of centreline

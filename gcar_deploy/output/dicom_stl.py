@@ -28,6 +28,13 @@ def dicom_stl_bytes(stl: bytes, sources: Sequence[str] = ()) -> bytes:
     UsageError
         pydicom is not installed.
     """
+    stream = io.BytesIO()
+    dicom_stl(stl, sources).save_as(stream, enforce_file_format=True)
+    return stream.getvalue()
+
+
+def dicom_stl(stl: bytes, sources: Sequence[str] = ()) -> Any:
+    """Return the data set of ``dicom_stl_bytes``."""
     try:
         from pydicom.dataset import FileDataset, FileMetaDataset
         from pydicom.uid import EncapsulatedSTLStorage, ExplicitVRLittleEndian, generate_uid
@@ -51,19 +58,18 @@ def dicom_stl_bytes(stl: bytes, sources: Sequence[str] = ()) -> bytes:
     ):  # fmt: skip
         setattr(data, keyword, "")
     data.Modality, data.SeriesNumber, data.InstanceNumber = "M3D", 1, 1
-    _equipment(data)
+    equipment(data)
     _model(data)
     data.BurnedInAnnotation = "NO"
     data.MIMETypeOfEncapsulatedDocument = "model/stl"
     data.EncapsulatedDocumentLength = len(stl)
     # Values have an even length in DICOM; the true one stands above.
     data.EncapsulatedDocument = stl + b"\0" * (len(stl) % 2)
-    stream = io.BytesIO()
-    data.save_as(stream, enforce_file_format=True)
-    return stream.getvalue()
+    return data
 
 
-def _equipment(data: Any) -> None:
+def equipment(data: Any) -> None:
+    """Enhanced General Equipment module."""
     from importlib.metadata import version
 
     data.Manufacturer, data.ManufacturerModelName = "gcar", "gcar"

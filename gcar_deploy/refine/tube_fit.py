@@ -10,6 +10,7 @@ import numpy as np
 from gcar_deploy.config import TreeOptions, TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.refine.calibre import fit_calibre
 from gcar_deploy.refine.choose import kept_tree, reinstated, weigh_pieces
 from gcar_deploy.refine.settle import settled
 from gcar_deploy.refine.support import grown_tree, seen_share, supported_tree, unexplained
@@ -144,6 +145,8 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     contrast = tuple(target.contrast for target in targets)
     if not now.tree.branches:
         return dataclasses.replace(start, tree=now.tree, contrast=contrast)
+    if not (options.levels_mm[-1] or progress.stopped or progress.failed):
+        now = _recalibred(now, targets, options)
     targets = rescaled(targets, now.prints)
     own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
     return dataclasses.replace(
@@ -157,6 +160,14 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
         if own and not options.levels_mm[-1]
         else (),
     )
+
+
+def _recalibred(now: _State, targets: list[Target], options: TubeOptions) -> _State:
+    """Refit the radii where the pixels are fine enough to show a narrow core."""
+    if _pixel_mm(targets) >= options.taper_pixel_mm:
+        return now
+    tubes, prints = fit_calibre(now.tubes, targets, now.prints, options)
+    return _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
 
 
 def _pixel_mm(targets: Sequence[Target]) -> float:

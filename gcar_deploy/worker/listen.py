@@ -160,17 +160,16 @@ def tell(write: Callable[[str], None]) -> Callable[[Job], None]:
     def on_change(job: Job) -> None:
         if job.open:
             return
-        write(
-            json.dumps(
-                {
-                    "study": job.order.out.name if job.order.out else None,
-                    "state": job.state,
-                    "out": None if job.folder is None else str(job.folder),
-                    "status": None if job.summary is None else job.summary["status"],
-                    "error": job.error,
-                    "exit_code": job.exit_code or 0,
-                }
-            )
-        )
+        told = {
+            "study": job.order.out.name if job.order.out else None,
+            "state": job.state,
+            "out": None if job.folder is None else str(job.folder),
+            "status": None if job.summary is None else job.summary["status"],
+            "error": job.error,
+            "exit_code": job.exit_code or 0,
+        }
+        if job.summary is not None and "sent" in job.summary:
+            told |= {key: job.summary[key] for key in ("sent", "send_error")}
+        write(json.dumps(told))
 
     return on_change

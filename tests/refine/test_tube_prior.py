@@ -58,7 +58,7 @@ def test_a_narrow_core_is_seen_in_fine_pixels():
     centers = points_of(truth, grid(64))
     least = {}
     for most in (1.0, OPTIONS.most_taper_easing):
-        options = dataclasses.replace(OPTIONS, most_taper_easing=most)
+        options = dataclasses.replace(OPTIONS, most_taper_easing=most, calibre_steps=0)
         tree = fit_tubes(centers, views, options).tree
         middle = np.abs(tree.points()[:, 2]) < 5
         least[most] = tree.radii()[middle].min() - 0.6
