@@ -26,6 +26,7 @@ class Column(NamedTuple):
 
 MEASURES: Mapping[str, Column] = {
     "dsc": Column("DSC(0.5) %"),
+    "shifted_dsc": Column("DSC(0.5), common shift allowed %"),
     "best_dsc": Column("best DSC %"),
     "ot_1mm": Column("Ot(1 mm) %"),
     "ot_2mm": Column("Ot(2 mm) %"),
@@ -90,7 +91,7 @@ def _row_of(line: Mapping[str, str]) -> dict[str, Any]:
     return {
         **{name: line[name] for name in _NAMES},
         "views": int(line["views"]),
-        "measures": {name: number[name] for name in (*MEASURES, "best_threshold")},
+        "measures": {name: number.get(name) for name in (*MEASURES, "best_threshold")},
         "reasons": dict(reasons),
         **{name: number[name] for name in COUNTS},
         "stages": {stage: seconds for stage, seconds in stages.items() if seconds is not None},
@@ -155,9 +156,13 @@ def markdown(rows: Sequence[Mapping[str, Any]], reference: str | None = None) ->
         for t in paired_tests(rows, reference)
     }  # fmt: skip
     out = []
-    columns = {**MEASURES, **COUNTS}
     for (protocol, views), group in grouped(summarise(rows), ("protocol", "views")).items():
         cases = max(entry["cases"] for entry in group)
+        columns = {
+            name: column
+            for name, column in {**MEASURES, **COUNTS}.items()
+            if name != "shifted_dsc" or any(entry[name]["n"] for entry in group)
+        }
         out.append(f"### {protocol} protocol, {views} views, {cases} cases\n")
         out.append("| " + " | ".join(["method", *(c.heading for c in columns.values())]) + " |")
         out.append("|---" * (1 + len(columns)) + "|")

@@ -17,6 +17,7 @@ from gcar_deploy.bundling import bundled, posed
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
@@ -28,6 +29,7 @@ from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hul
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.decide import decide
 from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.looks import mean_evidence, near_evidence, shifted_lattice
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.refine.landmarks import landmark_pixels
@@ -37,7 +39,7 @@ from gcar_deploy.refine.tube_model import footprint, tubes_of
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree, empty_tree
-from gcar_deploy.types import Mask
+from gcar_deploy.types import Image, Mask
 
 #: stages with their usual share of the time
 STAGES = (
@@ -108,9 +110,10 @@ def reconstruct(
         hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
         watch.check()
-        encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
+        known = [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)]
+        encoded = encode(hull, known)
     with watch.stage("centers"):
-        centers, told = _centers(predictor, hull, encoded, views, options, watch)
+        centers, told = _centers(predictor, hull, encoded, views, known, options, watch)
         if predictor is None:
             findings.append(_FALLBACK)
     with watch.stage("refine") as report:
@@ -170,6 +173,7 @@ def _centers(
     hull: Candidates,
     encoded: Encoded,
     views: Sequence[VesselImage],
+    known: Sequence[tuple[CArm, Image, bool]],
     options: RunOptions,
     watch: Stopwatch,
 ) -> tuple[CenterPoints, CenterPoints | None]:
@@ -183,6 +187,14 @@ def _centers(
             single = options.predict.single
             return merge_views(alone, hull, encoded, options.candidates, single), None
         told = predictor.predict(hull, encoded, stop)
+        others = []
+        for look in range(1, options.predict.looks):
+            lattice = shifted_lattice(hull.lattice, look)
+            near = near_evidence(hull, told.confidence, look, options.predict.look_again)
+            other = visual_hull([(c, p) for c, p, _ in known], lattice, options.candidates, near)
+            if len(other):
+                others.append((other, predictor.predict(other, encode(other, known), stop)))
+        told = mean_evidence(told, others)
     except CancelledError:
         watch.check()
         raise
@@ -281,8 +293,11 @@ def _bundled(
         watch.check()
         if len(hull) == 0:
             return empty_tree()
-        encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, placed, strict=True)])
-        centers, _ = _centers(predictor, hull, encoded, placed, options, watch)
+        known = [(*s, v.calibrated) for s, v in zip(seen, placed, strict=True)]
+        # One look is enough to say where the views stand.
+        quick = dataclasses.replace(options, predict=dataclasses.replace(options.predict, looks=1))
+        encoded = encode(hull, known)
+        centers, _ = _centers(predictor, hull, encoded, placed, known, quick, watch)
         return build_tree(centers, options.tree)
 
     found = bundled(views, poses, tree_of, options)

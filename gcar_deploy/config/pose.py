@@ -14,6 +14,8 @@ class PoseOptions:
     #: read; a direction the pictures say nothing about stays at zero
     offset_sigma_mm: float = 3.0
     angle_sigma_deg: float = 0.7
+    #: how well magnifications are known: an error looks like a patient moved along the beam
+    magnification_sigma: float = 0.005
     #: first search along the direction that two views see best, mm
     search_mm: float = 12.0
     step_mm: float = 1.0

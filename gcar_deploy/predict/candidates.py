@@ -59,7 +59,10 @@ def cubic_lattice(grid: Grid, spacing_mm: float) -> Grid:
 
 
 def visual_hull(
-    views: Sequence[tuple[CArm, Image]], lattice: Grid, options: CandidateOptions
+    views: Sequence[tuple[CArm, Image]],
+    lattice: Grid,
+    options: CandidateOptions,
+    among: Array | None = None,
 ) -> Candidates:
     """Find the lattice points whose ray holds vessel in every view.
 
@@ -72,12 +75,20 @@ def visual_hull(
     options : CandidateOptions
         ``min_path_cells``: a point is kept where the path length, interpolated at its
         projection, exceeds this share of a cell's edge.
+    among : (m, 3) indices of the only lattice points to ask, where they are known
 
     Returns
     -------
     Candidates, possibly empty
     """
     h = float(lattice.spacing_mm[0])
+    if among is not None:
+        points = lattice.index2world(among)
+        keep = np.ones(len(points), bool)
+        for carm, path in views:
+            keep[keep] = _supported(carm, path, points[keep], h, True, h, options)
+        order = np.lexsort(among[keep].T[::-1])
+        return Candidates(among[keep][order], points[keep][order], lattice)
     shape = np.asarray(lattice.shape)
     level = int(np.floor(np.log2(max(int(shape.max()) / 12, 1))))
     blocks = -(-shape // 2**level)

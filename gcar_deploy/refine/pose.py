@@ -26,7 +26,7 @@ from gcar_deploy.geometry.consistency import (
 )
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.refine.joint_pose import corrected, estimate_jointly
-from gcar_deploy.refine.profile_fit import fit_profiles
+from gcar_deploy.refine.profile_fit import fit_profiles, prior_root
 from gcar_deploy.types import Array, Image, Pixels
 
 
@@ -188,12 +188,13 @@ def _estimate(
     if not options.enabled or (calibrated and gap is None and apart <= options.agreed_calibrated):
         return given
     prior = np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+    root = prior_root(moving.carm, options)
 
     def residuals(theta: Array, sigma_mm: float, noise: float) -> Array:
         carm = corrected(moving.carm, theta)
         a, b = mass_profiles(fixed, moving, carm, sigma_mm)
         gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
-        return np.concatenate([(a - b) / (noise * np.sqrt(float(a @ a))), theta / prior, gaps])
+        return np.concatenate([(a - b) / (noise * np.sqrt(float(a @ a))), root @ theta, gaps])
 
     def left(theta: Array, sigma_mm: float) -> float:
         return mismatch(fixed, moving, corrected(moving.carm, theta), sigma_mm)
