@@ -18,10 +18,16 @@ _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
 @click.option("--noises", default="0,0.5,1,2", show_default=True, help="Start noise, voxels.")
-def refine_table(data: Path, cases: str, protocols: str, noises: str) -> None:
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=None,
+    help="Folder that keeps every fit; a run with the same folder goes on where it stopped.",
+)
+def refine_table(data: Path, cases: str, protocols: str, noises: str, out: Path | None) -> None:
     """Refine from the same true and noisy points in both modes, with and without centreline loss.
 
-    Example: gcar-export refine-table --data data --cases 0001,0134,0595
+    Example: gcar-export refine-table --data data --cases 0001,0134,0595 --out fits
     """
     from gcar_export import refine_table as refining
 
@@ -36,8 +42,10 @@ def refine_table(data: Path, cases: str, protocols: str, noises: str) -> None:
     tables = []
     with click.progressbar(length=total, label="fits", file=sys.stderr) as bar:
         for protocol in words(protocols):
-            rows = refining.refine_rows(data, protocol, words(cases), levels, lambda: bar.update(1))
-            tables.append(f"{protocol}, volume DSC at 0.5 in %\n\n{refining.table(rows, levels)}")
+            rows = refining.refine_rows(
+                data, protocol, words(cases), levels, out, lambda: bar.update(1)
+            )
+            tables.append(refining.table(rows, protocol))
     click.echo("\n\n".join(tables))
 
 
@@ -60,7 +68,8 @@ def cost_curves() -> None:
 @click.option("--trees", default=10, show_default=True, help="Trees per row.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
 @click.option("--predictors", default="multi,none", show_default=True)
-def sigma_table(seed: int, trees: int, protocols: str, predictors: str) -> None:
+@click.option("--parts", is_flag=True, help="Also what sigma is worth without some of its parts.")
+def sigma_table(seed: int, trees: int, protocols: str, predictors: str, parts: bool) -> None:
     """Compare the stated sigma with true errors on generated trees.
 
     Example: gcar-export sigma-table --seed 2 --trees 20
@@ -76,7 +85,8 @@ def sigma_table(seed: int, trees: int, protocols: str, predictors: str) -> None:
     rows = []
     with click.progressbar(length=len(cells) * trees, label="trees", file=sys.stderr) as bar:
         for cell in cells:
-            rows.append(
-                sigma.calibrate(*cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1))
+            made = sigma.calibrate_parts(
+                *cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1)
             )
+            rows += made if parts else made[-1:]
     click.echo(sigma.table(rows))

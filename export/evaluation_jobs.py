@@ -16,7 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.metrics import Measure, projection_measures, volume_measures
+from gcar_deploy.metrics import (
+    Measure,
+    best_shifted_dice,
+    projection_measures,
+    volume_measures,
+)
 from gcar_deploy.types import Array, Volume
 from gcar_export.labels import LabelVolume, read_label
 from gcar_export.method_settings import MethodSettings
@@ -115,9 +120,12 @@ def measure(case: Case, solved: Solved) -> dict[str, Measure]:
     """All measures of one solved case, by the names of ``evaluation_tables.MEASURES``.
 
     New projections are cast from the returned volume, clipped to 0 .. 1, and averaged over
-    the case's new views (those on which the measure is defined).
+    the case's new views (those on which the measure is defined). Where the patient moved between
+    the views, DSC is also given for the best common shift, which no two views can see.
     """
     found = volume_measures(case.truth, solved.volume, case.grid.spacing_mm)
+    if case.protocol == "moved":
+        found["shifted_dsc"] = best_shifted_dice(case.truth, solved.volume)
     per_view = []
     for carm, truth_mm in zip(case.new_views, case.new_projections(), strict=True):
         predicted = None

@@ -26,6 +26,7 @@ class Column(NamedTuple):
 
 MEASURES: Mapping[str, Column] = {
     "dsc": Column("DSC(0.5) %"),
+    "shifted_dsc": Column("DSC(0.5), common shift allowed %"),
     "best_dsc": Column("best DSC %"),
     "ot_1mm": Column("Ot(1 mm) %"),
     "ot_2mm": Column("Ot(2 mm) %"),
@@ -90,7 +91,7 @@ def _row_of(line: Mapping[str, str]) -> dict[str, Any]:
     return {
         **{name: line[name] for name in _NAMES},
         "views": int(line["views"]),
-        "measures": {name: number[name] for name in (*MEASURES, "best_threshold")},
+        "measures": {name: number.get(name) for name in (*MEASURES, "best_threshold")},
         "reasons": dict(reasons),
         **{name: number[name] for name in COUNTS},
         "stages": {stage: seconds for stage, seconds in stages.items() if seconds is not None},
@@ -155,9 +156,13 @@ def markdown(rows: Sequence[Mapping[str, Any]], reference: str | None = None) ->
         for t in paired_tests(rows, reference)
     }  # fmt: skip
     out = []
-    columns = {**MEASURES, **COUNTS}
     for (protocol, views), group in grouped(summarise(rows), ("protocol", "views")).items():
         cases = max(entry["cases"] for entry in group)
+        columns = {
+            name: column
+            for name, column in {**MEASURES, **COUNTS}.items()
+            if name != "shifted_dsc" or any(entry[name]["n"] for entry in group)
+        }
         out.append(f"### {protocol} protocol, {views} views, {cases} cases\n")
         out.append("| " + " | ".join(["method", *(c.heading for c in columns.values())]) + " |")
         out.append("|---" * (1 + len(columns)) + "|")
@@ -220,8 +225,11 @@ def not_first(rows: Sequence[Mapping[str, Any]], reference: str) -> list[str]:
         tests = [t for t in paired_tests(group, reference) if t["n"]]
         for (name,), column_tests in grouped(tests, ("measure",)).items():
             column = MEASURES[name]
-            behind, close = [], []
+            behind, close, equal = [], [], []
             for test in column_tests:
+                if not test["mean_difference"] and test["p"] is None:
+                    equal.append(f"{test['method']} (n={test['n']})")
+                    continue
                 ahead = test["mean_difference"] * column.better * column.factor
                 p = test["reason"] if test["p"] is None else f"p = {test['p']:.3f}"
                 if ahead <= 0:
@@ -230,6 +238,8 @@ def not_first(rows: Sequence[Mapping[str, Any]], reference: str) -> list[str]:
                     close.append(f"{test['method']} (by {ahead:.2f}, {p}, n={test['n']})")
             if close:
                 behind.append(f"not significantly ahead of {', '.join(close)}")
+            if equal:
+                behind.append(f"equal in every case: {', '.join(equal)}")
             if behind:
                 where = f"{protocol}, {views} views, {column.heading}"
                 out.append(f"{where}: {'; '.join(behind)}")

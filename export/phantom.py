@@ -9,6 +9,7 @@ shift as a whole; nothing else is fitted to it.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ from gcar_deploy.dicom.scene import read_views
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import ImageError, RefusedError, UsageError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.epipolar import ray_gaps
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
@@ -37,6 +39,7 @@ from gcar_export.alignment import align, read_stl, sample_surface
 SPACING_MM = 0.390625
 #: what is fitted; the rest is predicted
 SETS = (("IM7", "IM8"), ("IM1", "IM2"), ("IM3", "IM4"), ("IM1", "IM4"))
+THREE = ("IM1", "IM7", "IM8")
 FOUR = ("IM1", "IM4", "IM7", "IM8")
 #: near enough, pixels
 NEAR_PX = 3.0
@@ -79,13 +82,18 @@ class SurfaceGap:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """One set of runs: its tree, or why there is none; the other runs; the authors' surface."""
+    """One set of runs: its tree, or why there is none; the other runs; the authors' surface.
+
+    ``marks_mm`` is the median distance between the rays of hand-picked landmarks in any two of
+    the runs, where landmarks are known: a check of the poses that the fit knows nothing of.
+    """
 
     runs: tuple[str, ...]
     result: Result | None
     refusal: str
     predictions: tuple[Prediction, ...]
     surface: SurfaceGap | None
+    marks_mm: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -251,7 +259,7 @@ def run(
     phantom = load(data)
     engine = Engine(threads=1, options=RunOptions())
     fits = []
-    for runs in (*SETS, FOUR):
+    for runs in (*SETS, THREE, FOUR):
         if progress is not None:
             progress(f"fitting {' + '.join(runs)}")
         fits.append(fit(phantom, runs, engine))
@@ -259,4 +267,21 @@ def run(
         if progress is not None:
             progress(f"fitting {' + '.join(FOUR)} with landmarks")
         fits.append(fit(phantom, FOUR, engine, read_landmarks(landmarks, FOUR)))
+        fits = [marked(one, landmarks) for one in fits]
     return phantom, fits
+
+
+def marked(one: Fit, landmarks: Path) -> Fit:
+    """Add how far the rays of the landmarks miss each other, if its runs have landmarks."""
+    try:
+        marks = np.array(read_landmarks(landmarks, one.runs))
+    except UsageError:
+        return one
+    if one.result is None:
+        return one
+    carms = [view.carm for view in one.result.views]
+    gaps = [
+        ray_gaps(carms[i], carms[j], marks[:, i], marks[:, j])
+        for i, j in itertools.combinations(range(len(carms)), 2)
+    ]
+    return dataclasses.replace(one, marks_mm=float(np.median(np.abs(np.concatenate(gaps)))))

@@ -1,16 +1,19 @@
-"""Refinement from true points, with and without noise, on real trees: volume DSC and seconds.
+"""Refinement from true points, with and without noise, on real trees: three measures and seconds.
 
 DIR holds ``imagecas/*.label.nii.gz``. Starting points are the centres of the truth's voxels
 (any occupancy above 0, the occupancy as confidence); with noise each point is moved by its own
-Gaussian offset (standard deviation per axis, in voxels) and 10 % of them are dropped. Volume DSC
-at 0.5, as everywhere.
+Gaussian offset (standard deviation per axis, in voxels) and 10 % of them are dropped. Both modes
+start from the same points, and every measure is taken at its usual threshold.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +23,74 @@ from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.metrics import (
+    VOLUME_THRESHOLD,
+    Skeleton,
+    overlap_within,
+    projection_dice,
+    skeleton,
+    volume_dice,
+)
 from gcar_deploy.refine.refine import refine, refined_volume
-from gcar_deploy.tree.occupancy import tree_occupancy
-from gcar_deploy.types import Volume
+from gcar_deploy.types import Array, Volume
 from gcar_export.evaluate import case_name, find_labels
+from gcar_export.evaluation_tables import STARS
 from gcar_export.labels import read_label
-from gcar_export.protocols import make_case
+from gcar_export.protocols import Case, make_case
+from gcar_export.raycast import as_label, raycast
 
 NOISES = (0.0, 0.5, 1.0, 2.0)
 DROPPED = 0.1
+#: rows of the table: refiner, and whether the loss has its centreline part
+MODES = (("tube", False), ("tube", True), ("paper", False), ("paper", True))
+#: name in a row -> heading
+MEASURES = {
+    "dsc": "volume DSC(0.5) %",
+    "ot_1mm": "Ot(1 mm) %",
+    "new_dsc": "new-projection DSC(0.5 mm) %",
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Subject:
+    """A simulated case with everything of the truth that the measures need.
+
+    Attributes
+    ----------
+    case : Case
+    views : vessel images of its pictures
+    skeleton : of the true volume
+    new_mm : true path lengths in the new views, mm
+    """
+
+    case: Case
+    views: list[VesselImage]
+    skeleton: Skeleton
+    new_mm: list[Array]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """One fit.
+
+    Attributes
+    ----------
+    protocol, case : str
+    refiner, centreline : the mode
+    noise : of the start, voxels
+    measures : 0 .. 1 by the names of ``MEASURES``; None where undefined
+    cpu_s : CPU seconds of refinement and volume
+    settings : digest of the options
+    """
+
+    protocol: str
+    case: str
+    refiner: str
+    centreline: bool
+    noise: float
+    measures: Mapping[str, float | None]
+    cpu_s: float
+    settings: str
 
 
 def start_points(truth: Volume, grid: Grid, noise_voxels: float, seed: int) -> CenterPoints:
@@ -51,40 +113,6 @@ def start_points(truth: Volume, grid: Grid, noise_voxels: float, seed: int) -> C
     )
 
 
-def dice(truth: Volume, volume: Volume) -> float:
-    """Volume DSC at 0.5."""
-    a, b = truth >= 0.5, volume >= 0.5
-    return float(2 * np.count_nonzero(a & b) / max(np.count_nonzero(a) + np.count_nonzero(b), 1))
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One fit: DSC of the final volume and of the bare tubes, CPU seconds of both stages."""
-
-    dice: float
-    tube_dice: float
-    fit_s: float
-    volume_s: float
-
-
-def one_fit(
-    truth: Volume, grid: Grid, views: list[VesselImage], noise: float, options: RefineOptions
-) -> Row:
-    """Refine one start and score it; seconds are process CPU seconds."""
-    centers = start_points(truth, grid, noise, seed=0)
-    begin = time.process_time()
-    refined = refine(centers, views, options)
-    middle = time.process_time()
-    volume = refined_volume(refined, views, grid, options)
-    end = time.process_time()
-    bare = tree_occupancy(refined.tree, grid) if refined.tree is not None else volume
-    return Row(dice(truth, volume), dice(truth, bare), middle - begin, end - middle)
-
-
-#: rows of the table: refiner, and whether the loss has its centreline part
-MODES = (("tube", False), ("tube", True), ("paper", False), ("paper", True))
-
-
 def mode_options(refiner: str, centreline: bool) -> RefineOptions:
     """Options of one row; the paper's loss is half centreline where it has that part."""
     options = RefineOptions(refiner=refiner)
@@ -96,45 +124,162 @@ def mode_options(refiner: str, centreline: bool) -> RefineOptions:
     )
 
 
+def subject_of(case: Case) -> Subject:
+    """Extract the vessels and work out what the measures need of the truth."""
+    return Subject(
+        case=case,
+        views=[extract_vessels(a, RunOptions().imaging) for a in case.angiograms()],
+        skeleton=skeleton(case.truth >= VOLUME_THRESHOLD, case.grid.spacing_mm),
+        new_mm=case.new_projections(),
+    )
+
+
+def one_fit(subject: Subject, noise: float, mode: tuple[str, bool]) -> Row:
+    """Refine one start in one mode and score it; seconds are process CPU seconds."""
+    case, options = subject.case, mode_options(*mode)
+    centers = start_points(case.truth, case.grid, noise, seed=0)
+    begin = time.process_time()
+    refined = refine(centers, subject.views, options)
+    volume = refined_volume(refined, subject.views, case.grid, options)
+    seconds = time.process_time() - begin
+    return Row(
+        protocol=case.protocol,
+        case=case.name,
+        refiner=mode[0],
+        centreline=mode[1],
+        noise=noise,
+        measures=measured(subject, volume),
+        cpu_s=seconds,
+        settings=digest(mode),
+    )
+
+
+def measured(subject: Subject, volume: Volume) -> dict[str, float | None]:
+    """Measures of one volume by the names of ``MEASURES``; new views are averaged."""
+    case = subject.case
+    found = skeleton(volume >= VOLUME_THRESHOLD, case.grid.spacing_mm)
+    solid = as_label(np.clip(volume, 0, 1), case.grid)
+    new = [
+        projection_dice(truth_mm, raycast(solid, carm)).value
+        for carm, truth_mm in zip(case.new_views, subject.new_mm, strict=True)
+    ]
+    defined = [value for value in new if value is not None]
+    return {
+        "dsc": volume_dice(case.truth, volume).value,
+        "ot_1mm": overlap_within(subject.skeleton, found, 1.0).value,
+        "new_dsc": float(np.mean(defined)) if defined else None,
+    }
+
+
+def digest(mode: tuple[str, bool]) -> str:
+    """First letters of the SHA-256 of a mode's options: a row with another one is out of date."""
+    text = json.dumps(dataclasses.asdict(mode_options(*mode)), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
 def refine_rows(
     data: Path,
     protocol: str,
     cases: Sequence[str],
     noises: Sequence[float],
+    out: Path | None = None,
     on_fit: Callable[[], None] | None = None,
-) -> dict[tuple[str, bool], list[list[Row]]]:
-    """Fit every case from every start in every mode: mode -> per case, per noise, a row."""
-    found: dict[tuple[str, bool], list[list[Row]]] = {mode: [] for mode in MODES}
+) -> list[Row]:
+    """Fit every case from every start in every mode; rows that ``out`` has are read, not made."""
+    rows = []
     for path in labels_of(data, cases):
-        case = make_case(read_label(path), protocol)
-        views = [extract_vessels(a, RunOptions().imaging) for a in case.angiograms()]
+        subject = None
         for mode in MODES:
-            rows = []
             for noise in noises:
-                rows.append(one_fit(case.truth, case.grid, views, noise, mode_options(*mode)))
+                file = out and out / f"{protocol}-{case_name(path)}-{_name(mode)}-{noise:g}.json"
+                row = _kept(file, mode)
+                if row is None:
+                    subject = subject or subject_of(make_case(read_label(path), protocol))
+                    row = one_fit(subject, noise, mode)
+                    _keep(file, row)
+                rows.append(row)
                 if on_fit is not None:
                     on_fit()
-            found[mode].append(rows)
-    return found
+    return rows
 
 
 def labels_of(data: Path, cases: Sequence[str]) -> list[Path]:
     """Label volumes of the wanted cases, all where none are named."""
-    wanted = [p for p in find_labels(data) if not cases or case_name(p) in cases]
-    return wanted
+    return [p for p in find_labels(data) if not cases or case_name(p) in cases]
 
 
-def table(found: dict[tuple[str, bool], list[list[Row]]], noises: Sequence[float]) -> str:
-    """Markdown: mean volume DSC and CPU seconds of fit and volume, per mode and start noise."""
-    head = " | ".join(f"{noise:g} voxels" for noise in noises)
-    lines = [
-        f"| refiner | centreline loss | {head} | CPU s |",
-        "|---|---|" + "---|" * len(noises) + "---|",
-    ]
-    for (refiner, centreline), rows in found.items():
-        dice_ = np.array([[row.dice for row in case] for case in rows])
-        seconds = np.mean([[row.fit_s + row.volume_s for row in case] for case in rows])
-        cells = " | ".join(f"{100 * value:.1f}" for value in dice_.mean(axis=0))
-        with_ = "with" if centreline else "without"
-        lines.append(f"| {refiner} | {with_} | {cells} | {seconds:.2f} |")
-    return "\n".join(lines)
+def table(rows: Sequence[Row], protocol: str) -> str:
+    """Markdown, one table per measure: mean and SD per mode and start noise, and CPU seconds.
+
+    Stars: Wilcoxon signed rank, paired by case, against the first mode.
+    """
+    own = [row for row in rows if row.protocol == protocol]
+    noises = sorted({row.noise for row in own})
+    heads = " | ".join(f"{noise:g} voxels" for noise in noises)
+    parts = []
+    for name, heading in MEASURES.items():
+        lines = [
+            f"| {protocol}: {heading} | centreline loss | {heads} | CPU s |",
+            "|---|---|" + "---|" * len(noises) + "---|",
+        ]
+        for mode in MODES:
+            cells = [_cell(own, mode, noise, name) for noise in noises]
+            seconds = np.mean([row.cpu_s for row in own if (row.refiner, row.centreline) == mode])
+            with_ = "with" if mode[1] else "without"
+            lines.append(f"| {mode[0]} | {with_} | {' | '.join(cells)} | {seconds:.2f} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)
+
+
+def _cell(rows: Sequence[Row], mode: tuple[str, bool], noise: float, name: str) -> str:
+    found = _by_case(rows, mode, noise, name)
+    if not found:
+        return "-"
+    values = 100 * np.array(list(found.values()))
+    spread = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
+    first = _by_case(rows, MODES[0], noise, name)
+    pairs = [(value, first[case]) for case, value in found.items() if case in first]
+    return f"{values.mean():.1f}{spread}" + (_stars(pairs) if mode != MODES[0] else "")
+
+
+def _by_case(
+    rows: Sequence[Row], mode: tuple[str, bool], noise: float, name: str
+) -> dict[str, float]:
+    return {
+        row.case: value
+        for row in rows
+        if (row.refiner, row.centreline) == mode
+        and row.noise == noise
+        and (value := row.measures[name]) is not None
+    }
+
+
+def _stars(pairs: Sequence[tuple[float, float]]) -> str:
+    from scipy.stats import wilcoxon
+
+    difference = np.array([a - b for a, b in pairs])
+    if not difference.any():
+        return ""
+    p = float(wilcoxon(difference).pvalue)
+    return next((stars for level, stars in STARS if p < level), "")
+
+
+def _name(mode: tuple[str, bool]) -> str:
+    return mode[0] + ("-line" if mode[1] else "")
+
+
+def _kept(file: Path | None, mode: tuple[str, bool]) -> Row | None:
+    if file is None or not file.is_file():
+        return None
+    row = Row(**json.loads(file.read_text(encoding="utf-8")))
+    return row if row.settings == digest(mode) else None
+
+
+def _keep(file: Path | None, row: Row) -> None:
+    """Write the row whole or not at all."""
+    if file is None:
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_name(f"{file.name}.{os.getpid()}.partial")
+    partial.write_text(json.dumps(dataclasses.asdict(row)), encoding="utf-8")
+    partial.replace(file)

@@ -5,6 +5,9 @@ Every view after the first is turned and moved by draws from the prior that sigm
 centreline point, e is its distance from the true centreline and sigma the stated standard
 deviation in the worst direction across the vessel. Points further than ``GHOST_MM`` from any
 vessel are ghosts: no sigma speaks of them, and their share stands beside.
+
+Sigma has three parts, added in quadrature: what the fit's own equations say, the prior on the
+geometry, and the pixel's share. ``calibrate_parts`` leaves them out one by one.
 """
 
 from __future__ import annotations
@@ -22,6 +25,9 @@ from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.output.result import Result
+from gcar_deploy.refine.tube_fit import PIXEL_SHARE
+from gcar_deploy.refine.uncertainty import geometry_sigma
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
@@ -34,6 +40,8 @@ GHOST_MM = 5.0
 #: share of 95 % of a Gaussian, standard deviations
 Z95 = 1.96
 CONDITIONS = ("clean", "degraded")
+#: what sigma is made of, part after part; the last is the sigma that a result states
+PARTS = ("fit alone", "fit, geometry", "fit, geometry, pixel")
 #: noise of degraded pictures: share of the path, and mm
 NOISE_SHARE, NOISE_MM = 0.08, 0.15
 
@@ -45,6 +53,7 @@ class Calibration:
     Attributes
     ----------
     protocol, condition, predictor : what the cell is
+    parts : of sigma that are in it, one of ``PARTS``
     trees, points : how many went in; ``refused`` trees did not
     mean_z2 : mean of (e / sigma)^2, 1 where sigma is right
     coverage : share of points with e <= 1.96 sigma
@@ -56,6 +65,7 @@ class Calibration:
     protocol: str
     condition: str
     predictor: str
+    parts: str
     trees: int
     points: int
     mean_z2: float
@@ -75,7 +85,25 @@ def calibrate(
     trees: int,
     on_tree: Callable[[], None] | None = None,
 ) -> Calibration:
-    """Reconstruct generated trees and compare errors with sigma.
+    """Reconstruct generated trees and compare errors with the sigma that the results state.
+
+    Parameters and raises as for ``calibrate_parts``, whose last cell this is.
+    """
+    return calibrate_parts(protocol, condition, predictor, seed=seed, trees=trees, on_tree=on_tree)[
+        -1
+    ]
+
+
+def calibrate_parts(
+    protocol: str,
+    condition: str,
+    predictor: str,
+    *,
+    seed: int,
+    trees: int,
+    on_tree: Callable[[], None] | None = None,
+) -> list[Calibration]:
+    """Compare errors with sigma made of more and more of its parts, one cell per ``PARTS``.
 
     Parameters
     ----------
@@ -102,27 +130,48 @@ def calibrate(
         except GcarError:
             refused += 1
         else:
-            e, sigma = point_errors(result.tree, tree)
-            errors.append(e)
-            sigmas.append(sigma)
+            errors.append(point_errors(result.tree, tree)[0])
+            sigmas.append(sigma_parts(result))
         if on_tree is not None:
             on_tree()
-    e, sigma = (np.concatenate([np.zeros(0), *x]) for x in (errors, sigmas))
+    e = np.concatenate([np.zeros(0), *errors])
     near = e < GHOST_MM
-    z = e[near] / sigma[near]
-    return Calibration(
-        protocol=protocol,
-        condition=condition,
-        predictor=predictor,
-        trees=trees,
-        points=int(near.sum()),
-        mean_z2=float(np.mean(z**2)) if len(z) else float("nan"),
-        coverage=float(np.mean(z <= Z95)) if len(z) else float("nan"),
-        rmse_mm=float(np.sqrt(np.mean(e[near] ** 2))) if len(z) else float("nan"),
-        sigma_mm=float(np.sqrt(np.mean(sigma[near] ** 2))) if len(z) else float("nan"),
-        ghosts=float(np.mean(~near)) if len(e) else float("nan"),
-        refused=refused,
-    )
+    cells = []
+    for parts, sigma in zip(
+        PARTS, np.concatenate([np.zeros((3, 0)), *sigmas], axis=1), strict=True
+    ):
+        z = e[near] / sigma[near]
+        cells.append(
+            Calibration(
+                protocol=protocol,
+                condition=condition,
+                predictor=predictor,
+                parts=parts,
+                trees=trees,
+                points=int(near.sum()),
+                mean_z2=float(np.mean(z**2)) if len(z) else float("nan"),
+                coverage=float(np.mean(z <= Z95)) if len(z) else float("nan"),
+                rmse_mm=float(np.sqrt(np.mean(e[near] ** 2))) if len(z) else float("nan"),
+                sigma_mm=float(np.sqrt(np.mean(sigma[near] ** 2))) if len(z) else float("nan"),
+                ghosts=float(np.mean(~near)) if len(e) else float("nan"),
+                refused=refused,
+            )
+        )
+    return cells
+
+
+def sigma_parts(result: Result) -> Array:
+    """(3, n) sigma of each centreline point, mm, made of more and more of ``PARTS``.
+
+    What the result states is taken apart: geometry and pixel are worked out again, and what they
+    leave is the fit's.
+    """
+    carms = [view.carm for view in result.views]
+    stated = np.concatenate([branch.sigma_mm for branch in result.tree.branches])
+    geometry = geometry_sigma(result.tree.points(), carms, result.options.refine.tube)
+    pixel = PIXEL_SHARE * max(carm.pixel_at_isocenter_mm for carm in carms)
+    fit = np.sqrt(np.maximum(stated**2 - geometry**2 - pixel**2, 0.0))
+    return np.stack([fit, np.hypot(fit, geometry), stated])
 
 
 def point_errors(made: Tree, truth: SyntheticTree) -> tuple[Array, Array]:
@@ -135,14 +184,14 @@ def point_errors(made: Tree, truth: SyntheticTree) -> tuple[Array, Array]:
 def table(rows: Sequence[Calibration]) -> str:
     """Markdown."""
     lines = [
-        "| set-up | pictures | predictor | trees | points | mean z^2 | within 1.96 sigma % "
-        "| RMSE mm | sigma mm | ghosts % |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| set-up | pictures | predictor | sigma of | trees | points | mean z^2 "
+        "| within 1.96 sigma % | RMSE mm | sigma mm | ghosts % |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         used = f"{r.trees - r.refused} of {r.trees}" if r.refused else f"{r.trees}"
         lines.append(
-            f"| {r.protocol} | {r.condition} | {r.predictor} | {used} | {r.points} "
+            f"| {r.protocol} | {r.condition} | {r.predictor} | {r.parts} | {used} | {r.points} "
             f"| {r.mean_z2:.2f} | {100 * r.coverage:.1f} | {r.rmse_mm:.2f} | {r.sigma_mm:.2f} "
             f"| {100 * r.ghosts:.1f} |"
         )

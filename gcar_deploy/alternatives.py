@@ -114,8 +114,11 @@ def evidence_elsewhere(tree: Tree, told: CenterPoints, rays: Array, weights: Arr
     """
     if not tree.branches or not len(told):
         return None
-    distance, nearest = cKDTree(tree.points()).query(told.points_mm)
-    gap = distance - tree.radii()[nearest]
+    radii = np.append(tree.radii(), 0.0)
+    reach = float(radii.max()) + (CELLS_OFF + 1.0) * told.spacing_mm
+    # What lies further off than that is found at infinity: off in any case, and never on.
+    distance, nearest = cKDTree(tree.points()).query(told.points_mm, distance_upper_bound=reach)
+    gap = distance - radii[nearest]
     off = gap > CELLS_OFF * told.spacing_mm
     on = gap < 0.5 * told.spacing_mm
     worst = np.zeros(len(told))

@@ -167,13 +167,13 @@ def check_poses(
     corrections : (V,) shift in mm and larger turn in deg of each view
     """
     findings = []
+    hidden = ": the same move within the plane of the beams would leave no trace"
     for view, (shift, turn) in zip(views, corrections, strict=True):
         if shift > options.good_shift_mm or turn > options.good_turn_deg:
             findings.append(
                 f"view {view.view_id} had to be moved by {shift:.1f} mm and turned by "
                 f"{turn:.1f} deg to agree (up to {options.good_shift_mm:g} mm and "
-                f"{options.good_turn_deg:g} deg are usual): the same move within the plane of "
-                "the beams would leave no trace"
+                f"{options.good_turn_deg:g} deg are usual)" + (hidden if len(views) == 2 else "")
             )
     return findings
 

@@ -13,9 +13,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy import alternatives, quality
+from gcar_deploy.bundling import bundled, posed
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
@@ -27,16 +29,17 @@ from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hul
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.decide import decide
 from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.looks import mean_evidence, near_evidence, shifted_lattice
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.refine.landmarks import landmark_pixels
-from gcar_deploy.refine.pose import Pose, estimate_poses
+from gcar_deploy.refine.pose import Pose, estimate_poses, judged_poses
 from gcar_deploy.refine.refine import Refined, refine, refined_volume
 from gcar_deploy.refine.tube_model import footprint, tubes_of
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.centerline import build_tree
-from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Mask
+from gcar_deploy.tree.tree import Tree, empty_tree
+from gcar_deploy.types import Image, Mask
 
 #: stages with their usual share of the time
 STAGES = (
@@ -93,22 +96,24 @@ def reconstruct(
     with watch.stage("pose"):
         views, poses, apart = agreeing(angiograms, views, options)
         findings += apart
+        poses = _bundled(views, poses, grid, predictor, options, watch)
         findings += quality.check_poses(
             views, [(p.shift_mm, p.turn_deg) for p in poses], options.quality
         )
         findings += quality.check_consistency(
             views, [p.after for p in poses], options.quality, [p.partner for p in poses]
         )
-        views = [_posed(view, pose) for view, pose in zip(views, poses, strict=True)]
+        views = [posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
         lattice = cubic_lattice(grid, cell_mm(grid, options))
         seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
         hull = visual_hull(seen, lattice, options.candidates)
         quality.check_candidates(len(hull), lattice, options.quality)
         watch.check()
-        encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
+        known = [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)]
+        encoded = encode(hull, known)
     with watch.stage("centers"):
-        centers, told = _centers(predictor, hull, encoded, views, options, watch)
+        centers, told = _centers(predictor, hull, encoded, views, known, options, watch)
         if predictor is None:
             findings.append(_FALLBACK)
     with watch.stage("refine") as report:
@@ -168,6 +173,7 @@ def _centers(
     hull: Candidates,
     encoded: Encoded,
     views: Sequence[VesselImage],
+    known: Sequence[tuple[CArm, Image, bool]],
     options: RunOptions,
     watch: Stopwatch,
 ) -> tuple[CenterPoints, CenterPoints | None]:
@@ -181,6 +187,14 @@ def _centers(
             single = options.predict.single
             return merge_views(alone, hull, encoded, options.candidates, single), None
         told = predictor.predict(hull, encoded, stop)
+        others = []
+        for look in range(1, options.predict.looks):
+            lattice = shifted_lattice(hull.lattice, look)
+            near = near_evidence(hull, told.confidence, look, options.predict.look_again)
+            other = visual_hull([(c, p) for c, p, _ in known], lattice, options.candidates, near)
+            if len(other):
+                others.append((other, predictor.predict(other, encode(other, known), stop)))
+        told = mean_evidence(told, others)
     except CancelledError:
         watch.check()
         raise
@@ -240,8 +254,13 @@ def agreeing(
     return main, closer, findings
 
 
-def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Pose, ...]:
-    """Estimate the correction of every view against the first from their vessel profiles."""
+def poses_between(
+    views: Sequence[VesselImage], options: RunOptions, known: Sequence[Pose] | None = None
+) -> tuple[Pose, ...]:
+    """Estimate the correction of every view against the first from their vessel profiles.
+
+    With ``known`` corrections nothing is estimated, only what the profiles say of them.
+    """
     # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
     pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
     calibrated = [view.calibrated for view in views]
@@ -256,12 +275,33 @@ def poses_between(views: Sequence[VesselImage], options: RunOptions) -> tuple[Po
     for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
         scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
         marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
+    if known is not None:
+        return judged_poses(known, small, pose, marks, calibrated)
     return estimate_poses(small, pose, marks, calibrated)
 
 
-def _posed(view: VesselImage, pose: Pose) -> VesselImage:
-    carm = pose.applied(view.carm)
-    return view if carm is view.carm else dataclasses.replace(view, carm=carm)
+def _bundled(
+    views: Sequence[VesselImage], poses: tuple[Pose, ...], grid: Grid,
+    predictor: Predictor | None, options: RunOptions, watch: Stopwatch,
+) -> tuple[Pose, ...]:  # fmt: skip
+    """Poses of three and more views from their tree, and what the profiles say of them."""
+
+    def tree_of(placed: Sequence[VesselImage]) -> Tree:
+        lattice = cubic_lattice(grid, cell_mm(grid, options))
+        seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in placed]
+        hull = visual_hull(seen, lattice, options.candidates)
+        watch.check()
+        if len(hull) == 0:
+            return empty_tree()
+        known = [(*s, v.calibrated) for s, v in zip(seen, placed, strict=True)]
+        # One look is enough to say where the views stand.
+        quick = dataclasses.replace(options, predict=dataclasses.replace(options.predict, looks=1))
+        encoded = encode(hull, known)
+        centers, _ = _centers(predictor, hull, encoded, placed, known, quick, watch)
+        return build_tree(centers, options.tree)
+
+    found = bundled(views, poses, tree_of, options)
+    return poses if found == poses else poses_between(views, options, found)
 
 
 def _tree(refined: Refined, centers: CenterPoints, options: RunOptions) -> Tree:

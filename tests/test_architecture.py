@@ -18,7 +18,7 @@ FLOORS = {
     "imaging": 2, "gaussians": 2,
     "tree": 3, "dicom": 3,
     "predict": 4, "refine": 4,
-    "quality": 5, "metrics": 5, "alternatives": 5,
+    "quality": 5, "metrics": 5, "alternatives": 5, "bundling": 5,
     "output": 6,
     "selftest": 6, "data": 6,
     "reconstruct": 7,

@@ -11,7 +11,7 @@ from gcar_deploy.config.pictures import (
     ImagingOptions,
     PictureLimits,
 )
-from gcar_deploy.config.pose import PoseOptions
+from gcar_deploy.config.pose import BundleOptions, PoseOptions
 from gcar_deploy.config.predict import (
     CandidateOptions,
     DecideOptions,
@@ -29,6 +29,7 @@ from gcar_deploy.config.refine import (
 )
 
 __all__ = [
+    "BundleOptions",
     "CandidateOptions",
     "DecideOptions",
     "DicomLimits",
@@ -60,6 +61,7 @@ class RunOptions:
     dicom: DicomOptions = dataclasses.field(default_factory=DicomOptions)
     imaging: ImagingOptions = dataclasses.field(default_factory=ImagingOptions)
     pose: PoseOptions = dataclasses.field(default_factory=PoseOptions)
+    bundle: BundleOptions = dataclasses.field(default_factory=BundleOptions)
     candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)
     predict: PredictOptions = dataclasses.field(default_factory=PredictOptions)
     decide: DecideOptions = dataclasses.field(default_factory=DecideOptions)

@@ -14,6 +14,8 @@ class PoseOptions:
     #: read; a direction the pictures say nothing about stays at zero
     offset_sigma_mm: float = 3.0
     angle_sigma_deg: float = 0.7
+    #: how well magnifications are known: an error looks like a patient moved along the beam
+    magnification_sigma: float = 0.005
     #: first search along the direction that two views see best, mm
     search_mm: float = 12.0
     step_mm: float = 1.0
@@ -44,3 +46,31 @@ class PoseOptions:
     #: a correction must lower the disagreement to this share of what it was
     min_gain: float = 0.85
     max_evaluations: int = 40
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BundleOptions:
+    """Offsets of three and more views from the tree they show (see ``refine/bundle.py``)."""
+
+    #: a tree and its views' poses are fitted to each other at most so often
+    rounds: int = 2
+    #: breath and table: scale of the offset's prior, whose tails are heavy (Cauchy)
+    offset_scale_mm: float = 3.0
+    angle_sigma_deg: float = 0.7
+    #: one standard deviation of a picture's centreline (neighbours err alike, so this is more
+    #: than a single point's error), and of a point's step
+    line_sigma_mm: float = 1.0
+    point_sigma_mm: float = 2.0
+    #: how well a person marks the same point in two views, mm at the isocentre
+    landmark_sigma_mm: float = 0.5
+    #: a picture's line counts for a point within this reach, which shrinks to the second
+    reach_mm: float = 8.0
+    near_mm: float = 2.0
+    steps: int = 25
+    #: points of the tree this far apart, and how few say nothing
+    spacing_mm: float = 2.0
+    least_points: int = 20
+    #: a tree that lies this near to all lines, in pixels, is left alone (16 generated scenes, moved
+    #: and corrected by profiles: 0.2 .. 0.5); else the distance must fall to a share of what it was
+    least_px: float = 0.6
+    min_gain: float = 0.85

@@ -67,6 +67,10 @@ class PredictOptions:
 
     #: ``auto`` (the shipped model where there is one), ``multi``, ``single`` or ``none``
     predictor: str = "auto"
+    #: lattices on which the multi-view predictor judges the scene, each shifted against the others;
+    #: after the first only what lies near points of at least this confidence is asked again
+    looks: int = 2
+    look_again: float = 0.15
     #: edge of the lattice the predictor works on: the grid's own within these bounds, mm
     min_cell_mm: float = 0.85
     max_cell_mm: float = 1.5

@@ -59,7 +59,10 @@ def cubic_lattice(grid: Grid, spacing_mm: float) -> Grid:
 
 
 def visual_hull(
-    views: Sequence[tuple[CArm, Image]], lattice: Grid, options: CandidateOptions
+    views: Sequence[tuple[CArm, Image]],
+    lattice: Grid,
+    options: CandidateOptions,
+    among: Array | None = None,
 ) -> Candidates:
     """Find the lattice points whose ray holds vessel in every view.
 
@@ -72,12 +75,20 @@ def visual_hull(
     options : CandidateOptions
         ``min_path_cells``: a point is kept where the path length, interpolated at its
         projection, exceeds this share of a cell's edge.
+    among : (m, 3) indices of the only lattice points to ask, where they are known
 
     Returns
     -------
     Candidates, possibly empty
     """
     h = float(lattice.spacing_mm[0])
+    if among is not None:
+        points = lattice.index2world(among)
+        keep = np.ones(len(points), bool)
+        for carm, path in views:
+            keep[keep] = _supported(carm, path, points[keep], h, True, h, options)
+        order = np.lexsort(among[keep].T[::-1])
+        return Candidates(among[keep][order], points[keep][order], lattice)
     shape = np.asarray(lattice.shape)
     level = int(np.floor(np.log2(max(int(shape.max()) / 12, 1))))
     blocks = -(-shape // 2**level)
@@ -110,43 +121,57 @@ def _supported(
     pixels, depth = carm.project(points)
     ahead = depth > 1.0
     if finest:
-        value = bilinear(path, pixels)
-        return ahead & (value > options.min_path_cells * h)
+        least = options.min_path_cells * h
+        # An interpolated value is at most that of the pixels around: most points end there.
+        high = cv2.dilate((path > least).astype(np.uint8), np.ones((3, 3), np.uint8))
+        keep = ahead & (_nearest(high, pixels, 1) > 0)
+        keep[keep] = bilinear(path, pixels[keep]) > least
+        return keep
     # Footprint of the cell's circumscribed sphere, and a pixel or two for interpolation.
     nearest = max(float(depth.min()), 1.0) if len(depth) else 1.0
     reach = int(np.ceil(0.5 * np.sqrt(3) * edge * max(carm.focal_px) / nearest)) + 2
     seen = cv2.dilate(
         (path > 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     )
-    col = np.clip(np.rint(pixels[:, 0]), -1e6, 1e6).astype(np.int64)
-    row = np.clip(np.rint(pixels[:, 1]), -1e6, 1e6).astype(np.int64)
-    # A cell whose middle is outside the picture may still reach into it.
-    inside = (
-        (col >= -reach)
-        & (row >= -reach)
-        & (col < path.shape[1] + reach)
-        & (row < path.shape[0] + reach)
-    )
-    out = np.zeros(len(points), bool)
-    rc = np.clip(row[inside], 0, path.shape[0] - 1)
-    cc = np.clip(col[inside], 0, path.shape[1] - 1)
-    out[inside] = seen[rc, cc] > 0
-    return out & ahead
+    return ahead & (_nearest(seen, pixels, reach) > 0)
+
+
+def _nearest(picture: Array, pixels: Array, reach: int) -> Array:
+    """(n,) values at the nearest pixel; at the border up to ``reach`` outside, 0 beyond."""
+    rows, cols = picture.shape
+    col, row = np.rint(pixels).T
+    inside = (col >= -reach) & (row >= -reach) & (col < cols + reach) & (row < rows + reach)
+    out = np.zeros(len(pixels), picture.dtype)
+    # What is centred outside the picture may still reach into it.
+    c = np.clip(col[inside], 0, cols - 1).astype(np.int64)
+    r = np.clip(row[inside], 0, rows - 1).astype(np.int64)
+    out[inside] = picture[r, c]
+    return out
 
 
 def bilinear(image: Array, pixels: Array) -> Array:
     """(n,) values of ``image`` at (n, 2) pixels (col, row), bilinear; zero outside."""
-    rows, cols = image.shape
+    return bilinear_of([image], pixels)[0]
+
+
+def bilinear_of(images: Sequence[Array], pixels: Array) -> Array:
+    """(k, n) values of k images of one size, as ``bilinear`` gives those of one."""
+    rows, cols = images[0].shape
     col, row = pixels[:, 0], pixels[:, 1]
     inside = (col > -1) & (row > -1) & (col < cols) & (row < rows)
-    out = np.zeros(len(pixels))
     c, r = col[inside], row[inside]
     c0, r0 = np.floor(c).astype(np.int64), np.floor(r).astype(np.int64)
     fc, fr = c - c0, r - r0
-    padded = np.pad(image, 1)
-    total = np.zeros(len(c))
+    padded = [np.pad(image, 1).reshape(-1) for image in images]
+    total = np.zeros((len(images), len(c)))
     for dr, wr in ((0, 1 - fr), (1, fr)):
         for dc, wc in ((0, 1 - fc), (1, fc)):
-            total += wr * wc * padded[r0 + 1 + dr, c0 + 1 + dc]
-    out[inside] = total
+            weight = wr * wc
+            at = (r0 + 1 + dr) * (cols + 2) + c0 + 1 + dc
+            for sums, image in zip(total, padded, strict=True):
+                sums += weight * image[at]
+    if inside.all():
+        return total
+    out = np.zeros((len(images), len(pixels)))
+    out[:, inside] = total
     return out

@@ -13,13 +13,15 @@ import cv2
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.predict.candidates import Candidates, bilinear
+from gcar_deploy.predict.candidates import Candidates, bilinear_of
 from gcar_deploy.types import Array, Image
 
 #: number of per-view features that ``encode`` makes; part of the model's spec
 VIEW_FEATURES = 12
 #: coarser levels above the lattice itself
 LEVELS = 3
+#: neighbours are looked up in a table of the whole lattice up to so many cells, else searched for
+MAX_TABLE = 20_000_000
 _OFFSETS = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], dtype=np.int64
 )
@@ -118,9 +120,9 @@ def _view_inputs(
         cv2.blur(path, (9, 9), borderType=cv2.BORDER_CONSTANT),
         cv2.dilate(path, np.ones((3, 3), np.uint8)),
         cv2.erode(path, np.ones((3, 3), np.uint8)),
+        cv2.distanceTransform((path > 0).astype(np.uint8), cv2.DIST_L2, 3),
     ]
-    sampled = [bilinear(m, pixels) for m in maps]
-    inside = cv2.distanceTransform((path > 0).astype(np.uint8), cv2.DIST_L2, 3)
+    sampled = bilinear_of(maps, pixels)
     n_ray = count[ray]
     features = np.stack(
         [
@@ -133,7 +135,7 @@ def _view_inputs(
             np.minimum(path[row, col], 8) / 2,
             np.log(n_ray) / 2,
             2 * np.minimum(path[row, col] / n_ray, 1.5),
-            np.minimum(bilinear(inside, pixels), 6) / 2,
+            np.minimum(sampled[6], 6) / 2,
             np.full(len(depth), float(calibrated)),
             weight / 2,
         ],
@@ -165,13 +167,21 @@ def _neighbours(index: Array) -> Array:
     keys = (index + 1) @ stride
     out = np.full((n, 27), n, np.int64)
     out[:, 13] = np.arange(n)
+    dense = n > 0 and int(np.prod(span)) <= MAX_TABLE
+    if dense:
+        place = np.full(int(np.prod(span)), n, np.int32)
+        place[keys] = np.arange(n)
     for k in range(13):
         # Offset k and its opposite 26 - k are found by one search.
         wanted = keys + _OFFSETS[k] @ stride
-        at = np.searchsorted(keys, wanted)
-        at[at == n] = 0
-        hit = keys[at] == wanted if n else np.zeros(0, bool)
-        here, there = np.nonzero(hit)[0], at[hit]
+        if dense:
+            at = place[wanted]
+            here = np.flatnonzero(at < n)
+        else:
+            at = np.searchsorted(keys, wanted) if n else wanted
+            at[at == n] = 0
+            here = np.flatnonzero(keys[at] == wanted) if n else at
+        there = at[here]
         out[here, k] = there
         out[there, 26 - k] = here
     return out

@@ -19,6 +19,7 @@ from scipy import ndimage, sparse
 from scipy.optimize import minimize
 
 from gcar_deploy.config import TubeOptions
+from gcar_deploy.refine.support import least_seen
 from gcar_deploy.refine.targets import Target
 from gcar_deploy.refine.tube_model import Tubes, footprint, tubes_of
 from gcar_deploy.tree.edit import kept_branches, part_of
@@ -61,7 +62,7 @@ def reinstated(
     left: list[Array],
     options: TubeOptions,
 ) -> Pieces:
-    """Take back dropped pieces that every view misses after all.
+    """Take back dropped pieces that the views miss after all (``least_seen``).
 
     Vessels that overlap each other in all views seem too thick alone, and the shares may call
     one of them a ghost; once the others are fitted without it, its path is missing.
@@ -77,18 +78,16 @@ def reinstated(
     """
     tubes = dataclasses.replace(tubes_of(tree), log_radius=np.log(start_radius))
     dropped = pieces.share < options.min_share
-    found = np.where(dropped, np.inf, 0.0)
     count = len(pieces.share)
+    found = []
     for target, rest in zip(targets, left, strict=True):
         seen = footprint(tubes, target.carm, target.box_px)
         piece = pieces.segment[seen.segment]
         claim = np.minimum(rest.reshape(-1)[seen.pixel], seen.path_mm)
         whole = np.bincount(piece, seen.path_mm, minlength=count)
-        share = np.bincount(piece, claim, minlength=count) / np.maximum(whole, 1e-9)
-        found = np.minimum(found, share)
-    return dataclasses.replace(
-        pieces, share=np.where(found >= options.missed_share, 1.0, pieces.share)
-    )
+        found.append(np.bincount(piece, claim, minlength=count) / np.maximum(whole, 1e-9))
+    missed = dropped & (least_seen(np.stack(found)) >= options.missed_share)
+    return dataclasses.replace(pieces, share=np.where(missed, 1.0, pieces.share))
 
 
 def weigh_pieces(

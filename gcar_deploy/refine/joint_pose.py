@@ -20,7 +20,7 @@ from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
-from gcar_deploy.refine.profile_fit import fit_profiles
+from gcar_deploy.refine.profile_fit import fit_profiles, prior_root
 from gcar_deploy.types import Array, Scalars
 
 
@@ -101,7 +101,10 @@ class _Problem:
     def residuals(self, x: Array, sigma_mm: float, noise: float) -> Scalars:
         """All differences, landmark gaps and corrections over their standard deviations."""
         theta = _with_first(x)
-        parts = [(theta[1:] / self.prior).ravel()]
+        parts = [
+            prior_root(self.seen[k].carm, self.options) @ t if k in self.seen else t / self.prior
+            for k, t in enumerate(theta[1:], start=1)
+        ]
         for i, j in self.pairs:
             parts.append(self.differences(i, j, theta, sigma_mm) / noise)
             seen = self.marks[np.isfinite(self.marks[:, [i, j]]).all(axis=(1, 2))]

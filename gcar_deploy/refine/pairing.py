@@ -14,7 +14,12 @@ from gcar_deploy.types import Array, Scalars
 
 #: tubes may move and grow by this much before their pixels are paired anew, pixels.
 MARGIN_PX = 1.0
-#: segments of one branch further apart than this in order are separate crossings of a ray.
+#: a pixel counts for a segment where its foot lies this share of the reach beyond the segment's
+#: ends, or within twice what the bend there opens towards the outside
+LEAST_OVERLAP = 0.15
+BEND_OVERLAP = 2.0
+#: segments of one branch further apart than this in order, beyond as many as fit into half the
+#: reach, are separate crossings of a ray.
 RUN_GAP = 3
 
 
@@ -73,23 +78,28 @@ def paired(
     """
     a, b = ends
     wide = reach + MARGIN_PX
-    row, col, segment = _near_pixels(a, b, wide, ahead, shape)
+    row, col, segment = _near_pixels(a, b, wide, ahead, branch, shape)
     along = b - a
     inverse = 1.0 / np.maximum(np.einsum("ij,ij->i", along, along), 1e-12)
     table = np.concatenate([a, along, inverse[:, None], (wide**2)[:, None]], axis=1)
     x0, y0, dx, dy, inv, most = (c[segment] for c in np.ascontiguousarray(table.T, np.float32))
     x, y = col - x0, row - y0
     t = np.clip((x * dx + y * dy) * inv, np.float32(0), np.float32(1))
-    distance2 = (x - t * dx) ** 2 + (y - t * dy) ** 2
-    near = distance2 < most
-    pixel, segment, distance2 = (row * shape[1] + col)[near], segment[near], distance2[near]
-    # Segments come in order, so a stable sort by pixel alone sorts by pixel, then segment.
-    order = np.argsort(pixel, kind="stable")
-    pixel, segment, distance = pixel[order], segment[order], np.sqrt(distance2[order])
+    x -= t * dx
+    y -= t * dy
+    distance2 = x * x + y * y
+    near = np.flatnonzero(distance2 < most)
+    near = near[_by_pixel(row[near], col[near])]
+    pixel, segment = row[near] * shape[1] + col[near], segment[near]
+    distance = np.sqrt(distance2[near])
     new = np.ones(len(pixel), bool)
     own = branch[segment]
+    # Short segments (seen end-on) leave wider gaps in between, of those whose foot lies elsewhere.
+    gap = RUN_GAP + 0.5 * wide / np.maximum(np.sqrt(np.einsum("ij,ij->i", along, along)), 1e-6)
     new[1:] = (
-        (pixel[1:] != pixel[:-1]) | (own[1:] != own[:-1]) | (segment[1:] - segment[:-1] > RUN_GAP)
+        (pixel[1:] != pixel[:-1])
+        | (own[1:] != own[:-1])
+        | (segment[1:] - segment[:-1] > gap[segment[1:]])
     )
     run = np.cumsum(new) - 1
     if len(run):
@@ -124,21 +134,64 @@ def nearest_of_runs(pairing: Pairing, distance2: Scalars) -> Array:
     return hit[new]
 
 
+def _by_pixel(row: Array, col: Array) -> Array:
+    """Order by row, then column, then as given; two radix sorts, since no picture is that wide."""
+    order = np.argsort(col.astype(np.uint16), kind="stable")
+    return order[np.argsort(row.astype(np.uint16)[order], kind="stable")]
+
+
 def _near_pixels(
-    a: Array, b: Array, reach: Scalars, ahead: Array, shape: tuple[int, int]
+    a: Array, b: Array, wide: Scalars, ahead: Array, branch: Array, shape: tuple[int, int]
 ) -> tuple[Array, Array, Array]:
-    """Pair segments with the pixels of their boxes: row, col, segment."""
-    limit = np.array([shape[1], shape[0]])
-    big = 1e6
-    low = np.clip(np.nan_to_num(np.minimum(a, b) - reach[:, None], nan=big), -big, big)
-    high = np.clip(np.nan_to_num(np.maximum(a, b) + reach[:, None], nan=-big), -big, big)
-    low_i = np.clip(np.ceil(low).astype(np.int64), 0, limit)
-    size = np.maximum(np.clip(np.floor(high).astype(np.int64) + 1, 0, limit) - low_i, 0)
-    # Row by row: each row of a box is a stretch of columns.
-    height = size[:, 1] * (size[:, 0] > 0) * ahead
+    """Pair segments with the pixels whose foot on them lies between or little beyond their ends.
+
+    Such pixels fill a rectangle along each segment, found row by row: row, col, segment.
+    """
+    length = np.linalg.norm(b - a, axis=1)
+    unit = np.where(length[:, None] > 1e-9, (b - a) / np.maximum(length, 1e-9)[:, None], [1.0, 0.0])
+    low, high = _beyond(unit, wide, branch)
+    low, high = -low, length + high
+    ux, uy = unit.T
+    ends = np.stack([low * uy, high * uy]) + a[:, 1]
+    top = _whole(np.ceil(ends.min(axis=0) - wide * np.abs(ux)), shape[0])
+    height = _whole(np.floor(ends.max(axis=0) + wide * np.abs(ux)) + 1, shape[0]) - top
+    height = np.where(ahead, np.maximum(height, 0), 0)
     owner = np.repeat(np.arange(len(a)), height)
-    line = low_i[owner, 1] + np.arange(len(owner)) - np.repeat(np.cumsum(height) - height, height)
-    count = size[owner, 0]
+    line = np.arange(len(owner)) - np.repeat(np.cumsum(height) - height - top, height)
+    y = line - a[owner, 1]
+    # Both the foot and the distance grow linearly along a row: two stretches of columns.
+    ux, uy, w = ux[owner], uy[owner], wide[owner]
+    first, last = _stretch(low[owner] - y * uy, high[owner] - y * uy, ux)
+    left, right = _stretch(y * ux - w, y * ux + w, uy)
+    x = a[owner, 0]
+    start = _whole(np.ceil(x + np.maximum(first, left)), shape[1])
+    count = np.maximum(_whole(np.floor(x + np.minimum(last, right)) + 1, shape[1]) - start, 0)
     which = np.repeat(np.arange(len(owner)), count)
-    col = np.arange(len(which)) + np.repeat(low_i[owner, 0] - np.cumsum(count) + count, count)
+    col = np.arange(len(which)) - np.repeat(np.cumsum(count) - count - start, count)
     return line[which], col, owner[which]
+
+
+def _beyond(unit: Array, wide: Scalars, branch: Array) -> tuple[Scalars, Scalars]:
+    """How far beyond each end of a segment the foot of its pixels may lie, px.
+
+    All the way to the reach at the ends of a branch, which are round. In between neighbours take
+    over, but on the outside of a bend no foot falls between them.
+    """
+    bend = 0.5 * np.linalg.norm(unit[1:] - unit[:-1], axis=1)
+    share = np.minimum(LEAST_OVERLAP + BEND_OVERLAP * bend, 1.0)
+    share[branch[1:] != branch[:-1]] = 1.0
+    low = wide * np.concatenate([[1.0], share])[: len(wide)]
+    high = wide * np.concatenate([share, [1.0]])[: len(wide)]
+    return np.minimum(low + MARGIN_PX, wide), np.minimum(high + MARGIN_PX, wide)
+
+
+def _stretch(low: Scalars, high: Scalars, slope: Scalars) -> tuple[Scalars, Scalars]:
+    """Where ``low <= slope x <= high``: from, to."""
+    inverse = 1.0 / np.where(np.abs(slope) < 1e-9, 1e-9, slope)
+    one, two = low * inverse, high * inverse
+    return np.minimum(one, two), np.maximum(one, two)
+
+
+def _whole(values: Scalars, limit: int) -> Array:
+    """Whole numbers within 0 .. limit; NaN to 0."""
+    return np.clip(np.nan_to_num(values, nan=0.0), 0, limit).astype(np.int64)

@@ -26,7 +26,7 @@ from gcar_deploy.geometry.consistency import (
 )
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.refine.joint_pose import corrected, estimate_jointly
-from gcar_deploy.refine.profile_fit import fit_profiles
+from gcar_deploy.refine.profile_fit import fit_profiles, prior_root
 from gcar_deploy.types import Array, Image, Pixels
 
 
@@ -133,6 +133,25 @@ def estimate_poses(
     )
 
 
+def judged_poses(
+    poses: Sequence[Pose], views: Sequence[tuple[CArm, Image]], options: PoseOptions,
+    marks: Array, calibrated: Sequence[bool],
+) -> tuple[Pose, ...]:  # fmt: skip
+    """Return the same corrections with what profiles and landmarks say of them.
+
+    Parameters
+    ----------
+    poses : V corrections with their partners
+    views, options, calibrated : as for ``estimate_poses``
+    marks : (m, V, 2) landmarks, (col, row), nan where not seen
+    """
+    masses = [vessel_mass(*view, known) for view, known in zip(views, calibrated, strict=True)]
+    theta = np.stack([pose.theta for pose in poses])
+    return tuple(
+        _joint(k, theta, pose.partner, masses, options, marks) for k, pose in enumerate(poses)
+    )
+
+
 def _joint(
     k: int, theta: Array, partner: int, masses: Sequence[Mass | None], options: PoseOptions,
     marks: Array,
@@ -169,12 +188,13 @@ def _estimate(
     if not options.enabled or (calibrated and gap is None and apart <= options.agreed_calibrated):
         return given
     prior = np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+    root = prior_root(moving.carm, options)
 
     def residuals(theta: Array, sigma_mm: float, noise: float) -> Array:
         carm = corrected(moving.carm, theta)
         a, b = mass_profiles(fixed, moving, carm, sigma_mm)
         gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
-        return np.concatenate([(a - b) / (noise * np.sqrt(float(a @ a))), theta / prior, gaps])
+        return np.concatenate([(a - b) / (noise * np.sqrt(float(a @ a))), root @ theta, gaps])
 
     def left(theta: Array, sigma_mm: float) -> float:
         return mismatch(fixed, moving, corrected(moving.carm, theta), sigma_mm)

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 from scipy.optimize import least_squares
 
 from gcar_deploy.config import PoseOptions
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.types import Array, Scalars
 
 #: relative change of the objective or of the pose below which a fit ends
@@ -65,3 +67,19 @@ def fit_profiles(
         if now > options.most_left * lower:
             return fitted(x, options.fine_mm, now)
     return x
+
+
+def prior_root(carm: CArm, options: PoseOptions) -> Array:
+    """(5, 5) W with W theta standard normal under the prior of a view's correction.
+
+    A magnification off by a share m shows as a move of m times the source distance along the
+    beam, so the prior is wider there: else that part would be made up for by a move across.
+    """
+    beam = carm.axes[2]
+    along = np.hypot(
+        options.offset_sigma_mm, options.magnification_sigma * np.linalg.norm(carm.source_mm)
+    )
+    W = np.eye(5) / options.angle_sigma_deg
+    W[:3, :3] = np.eye(3) / options.offset_sigma_mm
+    W[:3, :3] += (1.0 / along - 1.0 / options.offset_sigma_mm) * np.outer(beam, beam)
+    return W

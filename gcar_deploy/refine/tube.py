@@ -17,11 +17,10 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.refine.arrow import Arrow
 from gcar_deploy.refine.targets import Target
 from gcar_deploy.refine.tube_model import Footprint, Tubes, footprint
 from gcar_deploy.refine.tube_prior import Prior, columns_of
@@ -149,7 +148,7 @@ def normal_equations(
     prints: list[Footprint],
     prior: Prior,
     options: TubeOptions,
-) -> tuple[sparse.csc_matrix, Scalars]:
+) -> tuple[Arrow, Scalars]:
     """Hessian (Gauss-Newton, majorised) and gradient over the unknowns."""
     count = len(tubes.first)
     size = 3 * len(tubes.positions_mm) + len(tubes.log_radius)
@@ -212,21 +211,10 @@ def _to_unknowns(tubes: Tubes, carm: CArm) -> Array:
     return out
 
 
-def _solve(hessian: sparse.csc_matrix, gradient: Scalars, damping: float) -> Scalars:
-    diagonal = hessian.diagonal()
-    damped = hessian + sparse.diags(damping * diagonal + 1e-9, format="csc")
-    step: Scalars = factorised(damped).solve(-gradient)
-    return step
-
-
-def factorised(hessian: sparse.csc_matrix) -> SuperLU:
-    """Factorise a symmetric positive definite matrix; the diagonal is its own best pivot."""
-    return splu(
-        hessian,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+def _solve(hessian: Arrow, gradient: Scalars, damping: float) -> Scalars:
+    """Damped step; NaN, which no one accepts, where the matrix is not positive definite."""
+    factor = hessian.damped(damping, 1e-9).factorised()
+    return np.full(len(gradient), np.nan) if factor is None else factor.solve(-gradient)
 
 
 def unknowns(tubes: Tubes) -> Scalars:

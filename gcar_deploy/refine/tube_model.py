@@ -185,15 +185,16 @@ def _crossed(
     scale = per_mm[i] + t * (per_mm[j] - per_mm[i])
     radius = np.exp(tubes.log_radius[i] + t * (tubes.log_radius[j] - tubes.log_radius[i])) * scale
     length, d_distance, d_radius = box_chord(distance, radius, box_px)
-    stretch = _inverse_sine(tubes, pixels, per_mm)
-    beyond = ((t <= 0) & _is_end(tubes, -1)[i]) | ((t >= 1) & _is_end(tubes, 1)[j])
+    begins, finishes = _is_end(tubes, -1), _is_end(tubes, 1)
+    stretch = _inverse_sine(tubes.points_mm, pixels, per_mm, begins, finishes)
+    beyond = ((t <= 0) & begins[i]) | ((t >= 1) & finishes[j])
     to_mm = np.where(beyond, 1.0, stretch[i] + t * (stretch[j] - stretch[i])) / scale
     path = length * to_mm
     middle = depth[i] + t * (depth[j] - depth[i])
     first = np.flatnonzero(np.concatenate([[True], pixel[1:] != pixel[:-1]])[: len(pixel)])
     crossings = np.diff(np.append(first, len(pixel)))
     group = np.repeat(np.arange(len(first)), crossings)
-    factor = _union_factor(group, crossings[group], middle, path)
+    factor = _union_factor(first, crossings, middle, path)
     path = path * factor
     to_mm = to_mm * factor
     return Footprint(
@@ -224,18 +225,21 @@ def box_chord(distance: Scalars, radius: Scalars, box: float) -> tuple[Scalars, 
     return length, 2 * radius * (root_u - root_l) / box, 2 * radius * angle / box
 
 
-def _inverse_sine(tubes: Tubes, pixels: Array, per_mm: Scalars) -> Scalars:
+def _inverse_sine(
+    points: Points, pixels: Array, per_mm: Scalars, begins: Array, finishes: Array
+) -> Scalars:
     """(n,) one over the sine between vessel and ray at each branch point.
 
     Taken between a point's neighbours and interpolated along segments, so that the path is
     continuous where two segments meet: a pixel there may count for either.
     """
-    before = np.where(_is_end(tubes, -1), 0, -1) + np.arange(len(pixels))
-    after = np.where(_is_end(tubes, 1), 0, 1) + np.arange(len(pixels))
-    points = tubes.points_mm
-    length = np.linalg.norm(points[after] - points[before], axis=1)
-    seen = np.linalg.norm(pixels[after] - pixels[before], axis=1)
-    sine = seen / np.maximum(0.5 * (per_mm[before] + per_mm[after]) * length, 1e-9)
+    index = np.arange(len(pixels))
+    before, after = index - ~begins, index + ~finishes
+    chord, shift = points[after] - points[before], pixels[after] - pixels[before]
+    length2 = np.einsum("ij,ij->i", chord, chord)
+    seen2 = np.einsum("ij,ij->i", shift, shift)
+    scale = 0.5 * (per_mm[before] + per_mm[after])
+    sine = np.sqrt(seen2 / np.maximum(scale * scale * length2, 1e-18))
     return 1.0 / np.clip(sine, MIN_SINE, 1.0)
 
 
@@ -247,27 +251,39 @@ def _is_end(tubes: Tubes, side: int) -> Array:
     return out
 
 
-def _union_factor(group: Array, crossings: Array, middle: Scalars, path: Scalars) -> Scalars:
+def _union_factor(first: Array, count: Array, middle: Scalars, path: Scalars) -> Scalars:
     """Per entry: (length of the union of a pixel's intervals) / (their sum)."""
     factor = np.ones(len(path))
-    shared = np.flatnonzero(crossings > 1)
-    if not len(shared):
-        return factor
-    half = 0.5 * path[shared]
-    order = shared[np.lexsort((middle[shared] - half, group[shared]))]
+    at = first[count == 2]
+    one, two = path[at], path[at + 1]
+    both = one + two
+    # Overlap of two intervals: what their halves reach beyond the distance of their middles.
+    shared = 0.5 * both - np.abs(middle[at + 1] - middle[at])
+    shared = np.clip(shared, 0.0, np.minimum(one, two))
+    factor[at] = factor[at + 1] = (both - shared) / np.maximum(both, 1e-12)
+    more = count > 2
+    if more.any():
+        start, size = first[more], count[more]
+        entries = np.repeat(start - np.cumsum(size) + size, size) + np.arange(size.sum())
+        group = np.repeat(np.arange(len(size)), size)
+        factor[entries] = _union_share(group, middle[entries], path[entries])
+    return factor
+
+
+def _union_share(group: Array, middle: Scalars, path: Scalars) -> Scalars:
+    """Per entry: length of the union of a group's intervals over their sum; by sorting."""
+    order = np.lexsort((middle - 0.5 * path, group))
     p = group[order]
     start = (middle - 0.5 * path)[order]
     stop = start + path[order]
     new = np.ones(len(p), bool)
     new[1:] = p[1:] != p[:-1]
-    number = np.cumsum(new) - 1
     # Running maximum of the stops inside each pixel, by shifting pixels far apart in depth.
-    base = number * 1e6
+    base = p * 1e6
     reached = np.maximum.accumulate(stop + base) - base
     before = np.full(len(p), -np.inf)
     before[1:] = reached[:-1]
     before[new] = -np.inf
     added = np.maximum(stop - np.maximum(start, before), 0.0)
-    union = np.bincount(number, added) / np.maximum(np.bincount(number, path[order]), 1e-12)
-    factor[order] = union[number]
-    return factor
+    union = np.bincount(p, added) / np.maximum(np.bincount(p, path[order]), 1e-12)
+    return union[group]

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from gcar_deploy.config import TubeOptions
+from gcar_deploy.refine.arrow import Arrow, plan_of
 from gcar_deploy.refine.tube_model import Tubes
 from gcar_deploy.types import Array, Scalars
 
@@ -28,7 +29,7 @@ class Prior:
     ----------
     A : (m, unknowns) sparse
     b : (m,)
-    hessian : (unknowns, unknowns) A^T A, with a place for every entry that the pictures add
+    hessian : A^T A
     slots : (s, 8, 8) where in ``hessian.data`` a segment's unknowns meet
     start, trust : what it was made of
     easing : factor on the taper's random walk
@@ -36,7 +37,7 @@ class Prior:
 
     A: sparse.csr_matrix
     b: Scalars
-    hessian: sparse.csc_matrix
+    hessian: Arrow
     slots: Array
     start: Tubes
     trust: Scalars
@@ -58,13 +59,11 @@ class Prior:
         out: Scalars = self.A.T @ (self.A @ x - self.b)
         return out
 
-    def added(self, blocks: Array) -> sparse.csc_matrix:
+    def added(self, blocks: Array) -> Arrow:
         """Hessian of the prior and of (s, 8, 8) blocks, one per segment, together."""
-        H = self.hessian
-        data = H.data + np.bincount(
-            self.slots.reshape(-1), blocks.reshape(-1), minlength=len(H.data)
-        )
-        return sparse.csc_matrix((data, H.indices, H.indptr), shape=H.shape)
+        size = len(self.hessian.data)
+        sums = np.bincount(self.slots.reshape(-1), blocks.reshape(-1), minlength=size + 1)
+        return Arrow(self.hessian.plan, self.hessian.data + sums[:size])
 
 
 def taper_easing(pixel_mm: float, options: TubeOptions) -> float:
@@ -92,8 +91,6 @@ def make_prior(
     points = tubes.points_mm
     gap = np.maximum(np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1), 1e-3)
     own = np.bincount(tubes.first, 0.5 * gap, n) + np.bincount(tubes.second, 0.5 * gap, n)
-    bend = _bending(tubes, gap, options.bend)
-    taper = _taper(tubes, gap, options.taper * easing)
     weight = np.bincount(tubes.owner, own * np.maximum(trust, LEAST_TRUST), p)
     hold = np.concatenate(
         [
@@ -102,18 +99,39 @@ def make_prior(
         ]
     )
     start = np.concatenate([tubes.positions_mm.reshape(-1), tubes.log_radius])
-    A = sparse.vstack(
-        [
-            sparse.hstack(
-                [sparse.kron(bend, sparse.eye(3)), sparse.csr_matrix((3 * bend.shape[0], n))]
-            ),
-            sparse.hstack([sparse.csr_matrix((len(gap), 3 * p)), taper]),
-            sparse.diags(hold),
-        ]
-    ).tocsr()
-    b = np.concatenate([np.zeros(3 * bend.shape[0] + len(gap)), hold * start])
-    hessian, slots = _with_places((A.T @ A).tocoo(), columns_of(tubes))
-    return Prior(A, b, hessian, slots, tubes, trust, easing)
+    # Rows of A with the unknowns that each one joins: three, two and one of them.
+    parts = [
+        _bending(tubes, gap, options.bend),
+        _taper(tubes, gap, options.taper * easing),
+        (np.arange(len(hold))[:, None], hold[:, None]),
+    ]
+    b = np.concatenate([np.zeros(len(parts[0][0]) + len(gap)), hold * start])
+    plan = plan_of(tubes)
+    slots, values = [], []
+    for column, value in parts:
+        product = value[:, :, None] * value[:, None, :]
+        pair = np.broadcast_arrays(column[:, :, None], column[:, None, :])
+        slots.append(plan.slots(*pair).reshape(-1))
+        values.append(product.reshape(-1))
+    data = np.bincount(
+        np.concatenate(slots), np.concatenate(values), minlength=plan.size + 1
+    ).astype(np.float64)[: plan.size]
+    columns = columns_of(tubes)
+    met = plan.slots(*np.broadcast_arrays(columns[:, :, None], columns[:, None, :]))
+    return Prior(_rows(parts, len(start)), b, Arrow(plan, data), met, tubes, trust, easing)
+
+
+def _rows(parts: list[tuple[Array, Array]], unknowns: int) -> sparse.csr_matrix:
+    """Stack (rows, k) columns and values, k the same within a part."""
+    counts = np.concatenate([np.full(len(column), column.shape[1]) for column, _ in parts])
+    return sparse.csr_matrix(
+        (
+            np.concatenate([value.reshape(-1) for _, value in parts]),
+            np.concatenate([column.reshape(-1) for column, _ in parts]),
+            np.concatenate([[0], np.cumsum(counts)]),
+        ),
+        shape=(len(counts), unknowns),
+    )
 
 
 def columns_of(tubes: Tubes) -> Array:
@@ -132,40 +150,19 @@ def columns_of(tubes: Tubes) -> Array:
     )
 
 
-def _with_places(matrix: sparse.coo_matrix, columns: Array) -> tuple[sparse.csc_matrix, Array]:
-    """Add zeros where segments' unknowns meet; (s, 8, 8) says where they are in the data."""
-    size = matrix.shape[0]
-    # Columns first: sorted, the keys are in the order of a CSC matrix.
-    met = (columns[:, None, :] * np.int64(size) + columns[:, :, None]).reshape(-1)
-    own = matrix.col.astype(np.int64) * size + matrix.row
-    keys = np.unique(np.concatenate([own, met]))
-    data = np.bincount(np.searchsorted(keys, own), matrix.data, minlength=len(keys))
-    pointer = np.searchsorted(keys, np.arange(size + 1) * np.int64(size))
-    hessian = sparse.csc_matrix(
-        (data.astype(np.float64), (keys % size).astype(np.int32), pointer.astype(np.int32)),
-        shape=(size, size),
-    )
-    return hessian, np.searchsorted(keys, met).reshape(len(columns), 8, 8)
-
-
-def _taper(tubes: Tubes, gap: Scalars, taper: float) -> sparse.csr_matrix:
-    """(s, n) steps of the log radius, scaled to a random walk."""
+def _taper(tubes: Tubes, gap: Scalars, taper: float) -> tuple[Array, Array]:
+    """(s, 2) unknowns and factors of the log radius' steps, scaled to a random walk."""
     w = 1.0 / (taper * np.sqrt(gap))
-    row = np.tile(np.arange(len(gap)), 2)
-    column = np.concatenate([tubes.first, tubes.second])
-    return sparse.csr_matrix(
-        (np.concatenate([w, -w]), (row, column)), shape=(len(gap), len(tubes.log_radius))
-    )
+    column = 3 * len(tubes.positions_mm) + np.stack([tubes.first, tubes.second], axis=1)
+    return column, np.stack([w, -w], axis=1)
 
 
-def _bending(tubes: Tubes, gap: Scalars, bend: float) -> sparse.csr_matrix:
-    """(m, p) second differences along the branches, scaled to a random walk of direction."""
+def _bending(tubes: Tubes, gap: Scalars, bend: float) -> tuple[Array, Array]:
+    """(m, 3) unknowns and factors of second differences, scaled to a random walk of direction."""
     k = np.flatnonzero(tubes.second[:-1] == tubes.first[1:])
-    a, b, c = (tubes.owner[x] for x in (tubes.first[k], tubes.second[k], tubes.second[k + 1]))
+    points = np.stack([tubes.first[k], tubes.second[k], tubes.second[k + 1]], axis=1)
     left, right = gap[k], gap[k + 1]
     scale = 1.0 / (bend * np.sqrt(0.5 * (left + right)))
-    value = np.concatenate([scale / left, -scale * (1 / left + 1 / right), scale / right])
-    row = np.tile(np.arange(len(k)), 3)
-    return sparse.csr_matrix(
-        (value, (row, np.concatenate([a, b, c]))), shape=(len(k), len(tubes.positions_mm))
-    )
+    value = np.stack([scale / left, -scale * (1 / left + 1 / right), scale / right], axis=1)
+    column = 3 * tubes.owner[points][:, None, :] + np.arange(3)[:, None]
+    return column.reshape(-1, 3), np.repeat(value, 3, axis=0)

@@ -8,11 +8,11 @@ is off by the stated prior, triangulated with the point's own rays (NUMERICAL: f
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
 from gcar_deploy.config import TubeOptions
+from gcar_deploy.errors import NumericalError
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.refine.tube import factorised
+from gcar_deploy.refine.arrow import Arrow
 from gcar_deploy.types import Array, Points, Scalars
 
 #: covariances are solved for every so many points and interpolated between.
@@ -24,28 +24,30 @@ CORRELATED_PIXELS = 6.0
 RELATIVE_CUT = 1e-6
 
 
-def fit_sigma(hessian: sparse.csc_matrix, owner: Array, tangents: Points) -> Scalars:
+def fit_sigma(hessian: Arrow, owner: Array, tangents: Points) -> Scalars:
     """(p,) largest standard deviation of each position across its vessel, mm.
 
     Along the vessel a point may slide without changing the tube, so that direction is left out.
 
     Parameters
     ----------
-    hessian : (3 p + n, 3 p + n) sparse
+    hessian : Arrow over the (3 p + n) unknowns
     owner : (n,) position of each branch point, in order along the branches
     tangents : (p, 3) unit vector along the vessel at each position
+
+    Raises
+    ------
+    NumericalError
+        The matrix is not positive definite.
     """
     positions = len(tangents)
     if not positions:
         return np.zeros(0)
-    factor = factorised(hessian)
+    factor = hessian.factorised()
+    if factor is None:
+        raise NumericalError("the normal matrix of the fit is not positive definite")
     chosen = np.unique(np.concatenate([owner[::EVERY], owner[-1:]]))
-    rhs = np.zeros((hessian.shape[0], 3 * len(chosen)))
-    column = np.arange(3 * len(chosen))
-    rhs[(3 * chosen[:, None] + np.arange(3)).reshape(-1), column] = 1.0
-    inverse = factor.solve(rhs)
-    blocks = inverse[(3 * chosen[:, None] + np.arange(3))].reshape(len(chosen), 3, len(chosen), 3)
-    own = blocks[np.arange(len(chosen)), :, np.arange(len(chosen))]
+    own = factor.position_blocks(chosen)
     t = tangents[chosen]
     across = np.eye(3) - t[:, :, None] * t[:, None, :]
     own = across @ own @ across

@@ -11,15 +11,17 @@ they stand for and smoothed.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TreeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.tree.curves import draw_branches
+from gcar_deploy.tree.raster import blurred, depth_of, hysteresis, peaks, splat, touching
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Points, Scalars
 
@@ -33,6 +35,8 @@ MAX_REACH_MM = 200.0
 MAX_CELLS = 40_000_000
 #: a larger given radius is no coronary vessel's, mm.
 MAX_GIVEN_RADIUS_MM = 6.0
+#: points with less confidence than this do not change what is above a threshold
+LEAST_CONFIDENCE = 1e-6
 #: empty cells round the raster.
 PAD = 4
 
@@ -109,92 +113,55 @@ def cell_graph(centers: CenterPoints, options: TreeOptions) -> CellGraph:
     h = centers.spacing_mm
     # Aligned with the first point, so that lattice points fall on cell centres.
     origin = centers.points_mm[0]
+    centers = centers.select(centers.confidence > LEAST_CONFIDENCE)
+    empty = sparse.csr_matrix((0, 0))
+    nothing = CellGraph(np.zeros((0, 3)), np.zeros(0), np.zeros(0), empty, empty, h)
+    if not len(centers):
+        return nothing
     at = (centers.points_mm - origin) / h
     low = np.floor(at.min(axis=0)).astype(np.int64) - PAD
     shape = np.ceil(at.max(axis=0)).astype(np.int64) + PAD + 1 - low
-    density = _splat(at - low, centers.confidence, shape)
-    value = ndimage.gaussian_filter(density, options.smooth_cells, truncate=3.0)
-    mask = _hysteresis(value, options.low, options.high)
-    middle = ndimage.gaussian_filter(np.minimum(density, 1.0), 1.5, truncate=2.0)
+    density = splat(at - low, centers.confidence, shape)
+    value = blurred(density, options.smooth_cells, 3.0)
+    mask = hysteresis(value, options.low, options.high)
     cells = np.argwhere(mask)
     if not len(cells):
-        empty = sparse.csr_matrix((0, 0))
-        return CellGraph(np.zeros((0, 3)), np.zeros(0), np.zeros(0), empty, empty, h)
+        return nothing
     pick = tuple(cells.T)
-    outside = np.argwhere(_grown(cells, mask.shape) & ~mask)
-    depth = cKDTree(outside).query(cells)[0]
-    cost, length = _steps(cells, value[pick], _relative(middle, pick), options)
+    middle = blurred(np.minimum(density, 1.0), 1.5, 2.0)
+    # How central each cell is: 1 where the middle peaks among the neighbours, else less.
+    central = middle[pick].astype(np.float64) / np.maximum(peaks(middle)[pick], 1e-12)
+    cost, length = _steps(cells, mask.shape, central, options)
     points = origin + (cells + low) * h
-    return CellGraph(points, value[pick], depth, cost, length, h)
-
-
-def _grown(cells: Array, shape: tuple[int, ...]) -> Array:
-    """Mask of the cells and their 26 neighbours; no cell lies on the border of ``shape``."""
-    out = np.zeros(int(np.prod(shape)), bool)
-    flat = np.ravel_multi_index(tuple(cells.T), shape)
-    for dx, dy, dz in np.ndindex(3, 3, 3):
-        out[flat + ((dx - 1) * shape[1] + dy - 1) * shape[2] + dz - 1] = True
-    return out.reshape(shape)
-
-
-def _splat(at: Array, weight: Scalars, shape: Array) -> Array:
-    """Trilinear deposit of (n,) weights at (n, 3) cell coordinates."""
-    at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
-    base = np.floor(at).astype(np.int64)
-    share = at - base
-    out = np.zeros(int(shape.prod()))
-    for dx in (0, 1):
-        for dy in (0, 1):
-            for dz in (0, 1):
-                d = np.array([dx, dy, dz])
-                w = weight * np.where(d, share, 1 - share).prod(axis=1)
-                flat = np.ravel_multi_index(tuple((base + d).T), tuple(shape))
-                out += np.bincount(flat, w, minlength=len(out))
-    return out.reshape(shape)
-
-
-def _hysteresis(value: Array, low: float, high: float) -> Array:
-    labels, count = ndimage.label(value >= low, np.ones((3, 3, 3)))
-    strong = np.zeros(count + 1, bool)
-    strong[np.unique(labels[value >= high])] = True
-    strong[0] = False
-    return strong[labels]
-
-
-def _relative(middle: Array, pick: tuple) -> Scalars:
-    """How central each cell is: 1 where ``middle`` peaks among the neighbours, else less."""
-    peak = ndimage.maximum_filter(middle, size=5)
-    return middle[pick] / np.maximum(peak[pick], 1e-12)
+    return CellGraph(points, value[pick].astype(np.float64), depth_of(cells, mask), cost, length, h)
 
 
 def _steps(
-    cells: Array, value: Scalars, central: Scalars, options: TreeOptions
+    cells: Array, shape: tuple[int, ...], central: Scalars, options: TreeOptions
 ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
     """Link neighbours, and bridge between pieces."""
-    tree = cKDTree(cells)
-    pairs = tree.query_pairs(1.8, output_type="ndarray")
-    length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=1)
+    n = len(cells)
+    pairs, length = touching(cells, shape)
     off_middle = 1 - np.minimum(central[pairs[:, 0]], central[pairs[:, 1]])
     cost = length * np.exp(MIDDLE_PREFERENCE * off_middle)
-    n = len(cells)
     grid = sparse.csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    bridges, gap = _bridges(
-        cells, value, csgraph.connected_components(grid, directed=False)[1], options
-    )
+    piece = csgraph.connected_components(grid, directed=False)[1]
+    bridges, gap = _bridges(cells, piece, options)
     pairs = np.concatenate([pairs, bridges])
     length = np.concatenate([length, gap])
     cost = np.concatenate([cost, gap * BRIDGE_COST])
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
     cols = np.concatenate([pairs[:, 1], pairs[:, 0]])
-    return (
-        sparse.csr_matrix((np.tile(cost, 2), (rows, cols)), shape=(n, n)),
-        sparse.csr_matrix((np.tile(length, 2), (rows, cols)), shape=(n, n)),
+    # Costs and lengths share one pattern: where an entry came from says what it is.
+    number = sparse.csr_matrix((np.tile(np.arange(len(pairs)), 2), (rows, cols)), shape=(n, n))
+    cost_of, length_of = (
+        sparse.csr_matrix((values[number.data], number.indices, number.indptr), shape=(n, n))
+        for values in (cost, length)
     )
+    return cost_of, length_of
 
 
-def _bridges(
-    cells: Array, value: Scalars, piece: Array, options: TreeOptions
-) -> tuple[Array, Scalars]:
+def _bridges(cells: Array, piece: Array, options: TreeOptions) -> tuple[Array, Scalars]:
     """Shortest links between separate pieces, a spanning forest of them: (b, 2), (b,) cells."""
     found: list[tuple[float, int, int]] = []
     count = int(piece.max()) + 1
@@ -229,40 +196,44 @@ def _root(parent: list[int], i: int) -> int:
 def _paths(graph: CellGraph, options: TreeOptions) -> list[Array]:
     """Cell paths from each tip to the tree so far; a component's first path is root to tip."""
     count, label = csgraph.connected_components(graph.cost, directed=False)
+    order = np.argsort(label, kind="stable")
+    members = np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1])
+    # One search serves all components, which do not touch each other.
+    starts = [int(m[np.argmax(graph.depth_cells[m])]) for m in members]
+    far = csgraph.dijkstra(graph.length, directed=False, indices=starts, min_only=True)
+    # The root is an end of the component, the farthest from its thickest cell.
+    roots = [int(m[np.argmax(far[m])]) for m in members]
+    reach = csgraph.dijkstra(graph.length, directed=False, indices=roots, min_only=True)
+    _, before, _ = csgraph.dijkstra(
+        graph.cost, directed=False, indices=roots, min_only=True, return_predecessors=True
+    )
     covered = np.zeros(len(label), bool)
-    on_tree = np.zeros(len(label), bool)
     lookup = cKDTree(graph.points_mm)
     paths: list[Array] = []
-    for k in range(count):
-        member = np.flatnonzero(label == k)
-        paths += _component_paths(graph, member, covered, on_tree, lookup, options)
+    for member, root in zip(members, roots, strict=True):
+        if reach[member].max() >= options.min_component_cells:
+            tips = member[np.argsort(-reach[member], kind="stable")]
+            paths += _component_paths(graph, root, tips, before, covered, lookup, options)
     return paths
 
 
 def _component_paths(
     graph: CellGraph,
-    member: Array,
+    root: int,
+    tips: Array,
+    before: Array,
     covered: Array,
-    on_tree: Array,
     lookup: cKDTree,
     options: TreeOptions,
 ) -> list[Array]:
-    start = member[int(np.argmax(graph.depth_cells[member]))]
-    far = csgraph.dijkstra(graph.length, directed=False, indices=start)
-    # The root is an end of the component, the farthest from its thickest cell's far end.
-    tip = member[int(np.argmax(far[member]))]
-    root = tip
-    reach = csgraph.dijkstra(graph.length, directed=False, indices=root)
-    if reach[member].max() < options.min_component_cells:
-        return []
-    _, before = csgraph.dijkstra(graph.cost, directed=False, indices=root, return_predecessors=True)
-    on_tree[root] = True
+    """Join the tips, in their order, to the tree that starts with ``root``."""
+    on_tree = {root}
     paths: list[Array] = []
-    for tip in member[np.argsort(-reach[member], kind="stable")]:
+    for tip in tips.tolist():
         if covered[tip]:
             continue
-        path = [int(tip)]
-        while not on_tree[path[-1]]:
+        path = [tip]
+        while path[-1] not in on_tree:
             path.append(int(before[path[-1]]))
         route = np.array(path)
         hidden = graph.depth_cells[route[-1]]
@@ -272,10 +243,10 @@ def _component_paths(
         keep = not paths or steps - hidden >= options.min_branch_cells
         if keep:
             paths.append(route)
-            on_tree[route] = True
+            on_tree.update(path)
             radius = (1.5 * graph.depth_cells[route] + 1.5) * graph.cell_mm
-            for near in lookup.query_ball_point(graph.points_mm[route], radius):
-                covered[near] = True
+            near = lookup.query_ball_point(graph.points_mm[route], radius, return_sorted=False)
+            covered[np.fromiter(itertools.chain.from_iterable(near), np.int64)] = True
         else:
             covered[tip] = True
     return paths

@@ -13,6 +13,9 @@ from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.tree.tree import Branch, Tree, empty_tree
 from gcar_deploy.types import Array, Points, Scalars
 
+#: points with less confidence than this move no centroid.
+LEAST_CONFIDENCE = 1e-6
+
 
 def draw_branches(
     cells_mm: Points, paths: list[Array], centers: CenterPoints, options: TreeOptions
@@ -115,8 +118,8 @@ def _recentre(
 
 
 def _centroids(points: Points, centers: CenterPoints) -> tuple[Points, Scalars]:
-    distance, nearest = cKDTree(points).query(centers.points_mm)
-    near = distance < 4.0 * centers.spacing_mm
+    centers = centers.select(centers.confidence > LEAST_CONFIDENCE)
+    near, nearest = _nearest(points, centers.points_mm, 4.0 * centers.spacing_mm)
     weight = centers.confidence * near
     mass = np.bincount(nearest, weight, minlength=len(points))
     total = np.stack(
@@ -127,6 +130,13 @@ def _centroids(points: Points, centers: CenterPoints) -> tuple[Points, Scalars]:
         axis=1,
     )
     return total / np.maximum(mass, 1e-9)[:, None], mass.astype(np.float64)
+
+
+def _nearest(points: Points, asked: Points, reach_mm: float) -> tuple[Array, Array]:
+    """(n,) whether one of ``points`` is within reach, and (n,) the nearest, 0 where none is."""
+    distance, nearest = cKDTree(points).query(asked, distance_upper_bound=reach_mm)
+    near = np.isfinite(distance)
+    return near, np.where(near, nearest, 0)
 
 
 def _joint_means(lines: list[Points], ends: Array, nodes: Points) -> Points:
@@ -154,8 +164,8 @@ def _radii(
 ) -> tuple[list[Scalars], list[Scalars]]:
     """Radius from the volume of the points that each stretch of line stands for."""
     points = np.concatenate(lines)
-    distance, nearest = cKDTree(points).query(centers.points_mm)
-    near = distance < max(4.0 * centers.spacing_mm, options.max_radius_mm)
+    reach = max(4.0 * centers.spacing_mm, options.max_radius_mm)
+    near, nearest = _nearest(points, centers.points_mm, reach)
     weight = centers.confidence * near
     volume = np.bincount(nearest, weight, minlength=len(points)) * centers.spacing_mm**3
     count = np.bincount(nearest, near.astype(float), minlength=len(points))

@@ -134,7 +134,7 @@ def test_truth_scores_perfectly_and_a_missing_volume_is_undefined(data):
     case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "paper")
     ok = methods.Solved(volume=case.truth, seconds={}, gaussians=None, status="ok", sentence="")
     found = evaluation_jobs.measure(case, ok)
-    assert set(evaluation_tables.MEASURES) <= set(found)
+    assert set(evaluation_tables.MEASURES) - {"shifted_dsc"} == set(found) - {"best_threshold"}
     assert found["dsc"].value == 1.0
     assert found["new_dsc"].value > 0.8
     none = methods.Solved(volume=None, seconds={}, gaussians=None, status="failed", sentence="")
@@ -316,6 +316,9 @@ def test_the_text_says_where_the_reference_is_not_first():
     (said,) = evaluation_tables.not_first(rows, "ours")
     assert said.startswith("paper, 2 views, DSC(0.5) %: sart leads by 6.00 (p = 0.004, n=9)")
     assert "not significantly ahead of fdk (by 0.89, p = " in said
+    rows += [{**row, "method": "ours-nopose"} for row in rows if row["method"] == "ours"]
+    (said,) = evaluation_tables.not_first(rows, "ours")
+    assert said.endswith("; equal in every case: ours-nopose (n=9)")
 
 
 def test_paper_layout_keeps_datasets_apart_and_marks_printed_figures():
@@ -352,6 +355,20 @@ def test_undefined_values_are_left_out_and_counted():
     assert {t["reason"] for t in tests} == {
         "all differences are zero", "no case on which both are defined",
     }  # fmt: skip
+
+
+def test_a_common_shift_is_asked_of_moved_patients_alone(data):
+    case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "moved")
+    ok = methods.Solved(
+        volume=np.roll(case.truth, (2, -1, 3), (0, 1, 2)), seconds={}, gaussians=None,
+        status="ok", sentence="",
+    )  # fmt: skip
+    found = evaluation_jobs.measure(case, ok)
+    assert found["shifted_dsc"].value == 1.0 and found["dsc"].value < 0.7
+    rows = [_row("0", "a", 0.5)]
+    assert "common shift" not in evaluation_tables.markdown(rows)
+    rows[0]["measures"]["shifted_dsc"] = 0.6
+    assert "common shift" in evaluation_tables.markdown(rows)
 
 
 def test_score_refuses_a_folder_that_is_no_case(tmp_path):

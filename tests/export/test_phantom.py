@@ -1,6 +1,8 @@
 """The phantom study: a shift that was made is found, and the real runs keep their figures."""
 
+import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,11 +10,22 @@ import pytest
 pytest.importorskip("torch", reason="needs the export extra")
 pytest.importorskip("pydicom", reason="needs the dicom extra")
 
-from gcar_deploy.config import ImagingOptions
+from gcar_deploy.config import ImagingOptions, RunOptions
+from gcar_deploy.engine import Engine
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.selftest import tiny_case
-from gcar_export.phantom import estimate_shift, load, predict, read_landmarks
+from gcar_export.phantom import (
+    FOUR,
+    Fit,
+    estimate_shift,
+    fit,
+    load,
+    marked,
+    predict,
+    read_landmarks,
+)
 from tests.conftest import data_dir
 
 
@@ -53,3 +66,28 @@ def test_the_real_runs_have_skeletons_and_a_surface():
     for view in phantom.vessels.values():
         assert view.skeleton.sum() * view.carm.pixel_at_isocenter_mm > 150
     assert np.ptp(phantom.surface_points, axis=0) == pytest.approx([120.5, 110.7, 110.0], abs=1.5)
+
+
+def test_landmarks_of_the_runs_judge_the_poses(tmp_path):
+    """Rays of one point meet where the poses are right, and miss by the shift where not."""
+    angiograms, _, tree = tiny_case()
+    views = [extract_vessels(a, ImagingOptions()) for a in angiograms]
+    points = tree.points()[:: max(1, len(tree.points()) // 9)]
+    marks = {n: v.carm.project(points)[0].tolist() for n, v in zip("AB", views, strict=True)}
+    path = tmp_path / "marks.json"
+    path.write_text(json.dumps({"pixels_col_row": marks}))
+    normal = plane_normal(views[0].carm, views[1].carm)
+    for shift in (0.0, 2.0):
+        moved = [views[0], dataclasses.replace(views[1], carm=views[1].carm.moved(shift * normal))]
+        one = Fit(("A", "B"), SimpleNamespace(views=moved), "", (), None)
+        assert marked(one, path).marks_mm == pytest.approx(shift, abs=0.1)
+    assert marked(Fit(("A", "C"), one.result, "", (), None), path).marks_mm is None
+
+
+@pytest.mark.slow
+def test_more_runs_predict_better():
+    """Four runs between which the table went by centimetres explain the two others."""
+    found = fit(load(data_dir()), FOUR, Engine(threads=1, options=RunOptions()))
+    assert found.result.status == "degraded"
+    assert min(p.share for p in found.predictions) > 0.9
+    assert min(p.back_share for p in found.predictions) > 0.88

@@ -82,7 +82,7 @@ def test_hessian_is_the_sum_over_entries():
             weight = target.weight.reshape(-1)[pixel] / (1 + z * z)
             weight *= print_.crossings[k] * (target.pixel_mm / sigma) ** 2
             expected += weight * np.outer(row, row)
-    np.testing.assert_allclose(hessian.toarray(), expected, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(hessian.dense(), expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_moved_tree_comes_back():
