@@ -3,8 +3,8 @@
 How far two profiles of one tree differ for other reasons than geometry is not known beforehand:
 in calibrated pictures it may be 0.1 % (pixels alone), in raw ones 20 %. So calibrated pictures
 are fitted with a tenth of the difference that is left as its error, again and again as long as
-that lowers it. What is left in the end counts as one standard deviation, all of the profile together
-as one measurement: a mismatch of other causes makes the priors strong again.
+that lowers it. What is left in the end counts as one standard deviation, all of the profile
+together as one measurement: a mismatch of other causes makes the priors strong again.
 """
 
 from __future__ import annotations
