@@ -14,6 +14,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.tree import Tree
 from gcar_export.labels import LabelVolume, read_label
 from gcar_export.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.render import path_lengths
@@ -74,7 +75,18 @@ def generated_tubes(seed: int) -> tuple[Tube, ...]:
 
 def label_tubes(path: Path) -> tuple[Tube, ...]:
     """Left tree of a label volume: its centreline with radii, as the runtime builds it."""
-    label: LabelVolume = read_label(path).left_right()[0].centred().cropped()
+    out = []
+    for k, branch in enumerate(thinned_label(path, "left").branches, start=1):
+        step = branch.length_mm / max(len(branch) - 1, 1)
+        radius = gaussian_filter1d(branch.radius_mm, RADIUS_SMOOTH_MM / max(step, 1e-6))
+        out.append(Tube(str(k), branch.points_mm, radius))
+    return tuple(out)
+
+
+def thinned_label(path: Path, side: str) -> Tree:
+    """Tree of one side (``left``, ``right``) of a label volume, centred, mm LPS."""
+    sides = read_label(path).left_right()
+    label: LabelVolume = sides[("left", "right").index(side)].centred().cropped()
     shape = np.ceil(np.asarray(label.grid.size_mm) / LABEL_VOXEL_MM).astype(int)
     grid = Grid(
         center_mm=label.grid.center_mm,
@@ -83,7 +95,7 @@ def label_tubes(path: Path) -> tuple[Tube, ...]:
     )
     volume = label.on_grid(grid)
     index = np.argwhere(volume > 0)
-    tree = build_tree(
+    return build_tree(
         CenterPoints(
             points_mm=grid.index2world(index),
             confidence=volume[volume > 0].astype(float),
@@ -92,12 +104,6 @@ def label_tubes(path: Path) -> tuple[Tube, ...]:
             source="hull",
         )
     )
-    out = []
-    for k, branch in enumerate(tree.branches, start=1):
-        step = branch.length_mm / max(len(branch) - 1, 1)
-        radius = gaussian_filter1d(branch.radius_mm, RADIUS_SMOOTH_MM / max(step, 1e-6))
-        out.append(Tube(str(k), branch.points_mm, radius))
-    return tuple(out)
 
 
 def with_stenosis(

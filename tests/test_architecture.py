@@ -23,7 +23,7 @@ FLOORS = {
     "selftest": 6, "data": 6,
     "reconstruct": 7,
     "engine": 8,
-    "inspection": 9, "worker": 9, "batch": 9, "benchmark": 9,
+    "inspection": 9, "worker": 9, "batch": 9, "benchmark": 9, "stages": 9,
     "cli": 10,
 }  # fmt: skip
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load

@@ -20,8 +20,13 @@ COLUMNS = (
 
 @click.command("bench")
 @click.option(
-    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
-)
+    "--out", "out_dir", default=None, type=click.Path(path_type=Path),
+    help="New folder; needed without --stages.",
+)  # fmt: skip
+@click.option(
+    "--stages", is_flag=True,
+    help="Only print seconds per stage, of a new process and of a warm engine.",
+)  # fmt: skip
 @click.option("--data", type=_FOLDER, help="Label volumes to simulate views of, beside the demo.")
 @click.option("--quick", is_flag=True, help="A coarse grid: about a tenth of the time.")
 @click.option(
@@ -32,7 +37,8 @@ COLUMNS = (
 @click.option("--quiet", is_flag=True, help="Neither progress nor warnings.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
 def bench(
-    out_dir: Path,
+    out_dir: Path | None,
+    stages: bool,
     data: Path | None,
     quick: bool,
     repeats: int,
@@ -45,15 +51,22 @@ def bench(
 
     The grid runs over iterations, Gaussians, resolution, refiner and predictor. Times are those
     of a warm reconstruction, and with itk-rtk installed also multiples of one projection pair.
+    With --stages no file is written: a table of medians goes to stdout.
 
     \b
     Example:
       gcar bench --quick --out bench
+      gcar bench --stages --repeats 5
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
 
     set_up_logging(verbose, quiet)
     limit_threads(threads)
+    if stages:
+        click.echo(_stages(repeats, threads, quiet))
+        return
+    if out_dir is None:
+        raise UsageError("--out is missing: name a new folder, or ask for --stages")
     csv_file, svg_file = out_dir / "bench.csv", out_dir / "bench.svg"
     for path in (csv_file, svg_file):
         if path.exists() and not force:
@@ -75,6 +88,14 @@ def bench(
     first = [row for row in rows if row.case == cases[0].name]
     svg_file.write_text(chart(first, cases[0].name), encoding="utf-8")
     click.echo("\n".join([str(csv_file), str(svg_file), *_lines(first, pair is not None)]))
+
+
+def _stages(repeats: int, threads: int | None, quiet: bool) -> str:
+    from gcar_deploy.stages import stage_seconds, table
+
+    with ProgressBar(quiet=quiet) as bar:
+        cold, warm = stage_seconds(repeats, threads, lambda share: bar("stages", share))
+    return table(cold, warm)
 
 
 def chart(rows: list[Any], name: str) -> str:

@@ -74,7 +74,9 @@ def demo(
         result = engine.reconstruct(
             case.pictures, case.geometry, on_progress=bar, deadline_s=deadline
         )
-    measures = volume_measures(case.truth(), result.volume, result.grid.spacing_mm)
+    measures = volume_measures(
+        case.truth(), result.volume, result.grid.spacing_mm, structure=as_json
+    )
     result.save(out_dir, force=force)
     whole = time.perf_counter() - started
     if as_json:

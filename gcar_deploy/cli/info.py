@@ -80,6 +80,22 @@ def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:
     return out
 
 
+def names_of(branches: list[dict[str, Any]]) -> str:
+    """Named vessels with their length and least confidence, or that there is none."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for branch in branches:
+        if branch.get("name"):
+            found.setdefault(branch["name"], []).append(branch)
+    return (
+        ", ".join(
+            f"{name} {sum(b['length_mm'] for b in own):.0f} mm "
+            f"({int(100 * min(b['name_confidence'] for b in own))} %)"
+            for name, own in found.items()
+        )
+        or "none is probable enough; branches have numbers"
+    )
+
+
 def lines(path: Path, summary: dict[str, Any]) -> list[str]:
     """Return the summary for people."""
     tree, counts = summary["tree"], summary["counts"]
@@ -89,6 +105,7 @@ def lines(path: Path, summary: dict[str, Any]) -> list[str]:
         f"  {summary['sentence']}",
         f"  tree: {len(tree['branches'])} branches, {tree['length_mm']:.0f} mm, "
         f"{counts['gaussians']} Gaussians",
+        f"  names: {names_of(tree['branches'])}",
         f"  made by: {summary['predictor']} + {summary['refiner']}, model "
         + ("none" if model is None else f"{model['name']} {model['sha256'][:12]}")
         + f", gcar {summary['versions'].get('gcar')}",

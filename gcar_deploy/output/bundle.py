@@ -50,8 +50,8 @@ def render_files(result: Result, extras: Sequence[str] = ()) -> dict[str, bytes]
         "volume.nii.gz": lambda: nifti_bytes(result.volume, result.grid),
         "gaussians.npz": lambda: gaussians_npz(result.gaussians),
         "gaussians.ply": lambda: gaussians_ply(result.gaussians),
-        "centerline.vtp": lambda: centerline_vtp(result.tree),
-        "centerline.csv": lambda: centerline_csv(result.tree),
+        "centerline.vtp": lambda: centerline_vtp(result.tree, result.names),
+        "centerline.csv": lambda: centerline_csv(result.tree, result.names),
         "surface.stl": lambda: stl_bytes(surface),
     }
     if "glb" in extras:

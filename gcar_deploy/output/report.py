@@ -162,9 +162,17 @@ def _angles(summary: Mapping[str, Any]) -> str:
     return _rows(rows) or "<tr><td>none</td></tr>"
 
 
+def branch_title(number: int, row: Mapping[str, Any]) -> str:
+    """Return the number of a branch, from 1, and its name with the probability if it has one."""
+    if row["name"] is None:
+        return str(number + 1)
+    # Rounded down: what is not certain never reads 100 %.
+    return f"{number + 1} {row['name']} ({int(100 * row['name_confidence'])} %)"
+
+
 def _branch(number: int, row: Mapping[str, Any], hidden: Sequence[float]) -> str:
     cells = [
-        str(number + 1),
+        html.escape(branch_title(number, row)),
         f"{row['length_mm']:.1f}",
         f"{2 * row['mean_radius_mm']:.2f}",
         _number(row["minimal_diameter_mm"]),

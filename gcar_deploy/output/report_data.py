@@ -101,6 +101,7 @@ def _branch(
         "reference": _known(reference[keep], 2),
         "sigma": _known(branch.sigma_mm[keep], 2),
         "seen": seen,
+        "name": None if (name := result.names[number]) is None else name.name,
         "color": f"rgb({red},{green},{blue})",
         "least": None
         if lumen.minimal_at_mm is None

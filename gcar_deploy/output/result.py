@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import platform
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ from gcar_deploy.quality import Quality
 from gcar_deploy.refine.pose import Pose
 from gcar_deploy.tree.further_view import best_further_view
 from gcar_deploy.tree.lumen import BranchLumen, bifurcation_angles, branch_lumens
+from gcar_deploy.tree.naming import LEAST_CONFIDENCE, BranchName, name_branches
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Volume
 
@@ -93,6 +95,11 @@ class Result:
         calibrated = all(view.calibrated for view in self.views)
         return calibrated and after is not None and after <= EXACT_DISAGREEMENT
 
+    @functools.cached_property
+    def names(self) -> tuple[BranchName | None, ...]:
+        """Name of each branch (LM, LAD, LCx, RCA) with its probability; None: a number only."""
+        return name_branches(self.tree)
+
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
         reasons: dict[str, str] = {}
@@ -110,9 +117,9 @@ class Result:
             "tree": {
                 "length_mm": self.tree.length_mm,
                 "branches": [
-                    _branch(branch, lumen)
-                    for branch, lumen in zip(
-                        self.tree.branches, branch_lumens(self.tree), strict=True
+                    _branch(branch, lumen, name)
+                    for branch, lumen, name in zip(
+                        self.tree.branches, branch_lumens(self.tree), self.names, strict=True
                     )
                 ],
                 "bifurcations": bifurcations(self.tree),
@@ -137,6 +144,8 @@ class Result:
         for path in reasons:
             if path.startswith("/tree/branches/") and path.endswith(_LUMEN):
                 reasons[path] = "the branch is too short to state a stenosis"
+            if path.endswith(("/name", "/name_confidence")):
+                reasons[path] = f"no name is as probable as {LEAST_CONFIDENCE:g}"
         if self.model is None:
             reasons["/model"] = "made without a model"
         out["reasons"] = reasons
@@ -215,9 +224,11 @@ def bifurcations(tree: Tree) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def _branch(branch: Branch, lumen: BranchLumen) -> dict[str, Any]:
+def _branch(branch: Branch, lumen: BranchLumen, name: BranchName | None) -> dict[str, Any]:
     known = branch.sigma_mm[np.isfinite(branch.sigma_mm)]
     return {
+        "name": None if name is None else name.name,
+        "name_confidence": None if name is None else name.confidence,
         "start": branch.start,
         "end": branch.end,
         "length_mm": branch.length_mm,

@@ -13,6 +13,7 @@ import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.tree.lumen import branch_lumens
+from gcar_deploy.tree.naming import BranchName
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 
@@ -78,8 +79,12 @@ def gaussians_ply(gaussians: Gaussians) -> bytes:
     return ("\n".join(header) + "\n").encode("ascii") + columns.astype("<f4").tobytes()
 
 
-def centerline_vtp(tree: Tree) -> bytes:
-    """XML PolyData, one polyline per branch, mm LPS, for VMTK and 3D Slicer."""
+def centerline_vtp(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes:
+    """XML PolyData, one polyline per branch, mm LPS, for VMTK and 3D Slicer.
+
+    ``names`` has one entry per branch, or none at all. A branch without one has an empty
+    ``VesselName`` and no (NaN) ``NameConfidence``.
+    """
     sizes = [len(branch) for branch in tree.branches]
     radius = tree.radii()
     point_data = {
@@ -98,6 +103,7 @@ def centerline_vtp(tree: Tree) -> bytes:
         "StenosisPercent": _of_lumens(tree, "stenosis_percent"),
         "LesionLength": _of_lumens(tree, "lesion_length_mm"),
     }
+    told = _told(tree, names)
     count = int(sum(sizes))
     out = [
         '<?xml version="1.0"?>',
@@ -110,6 +116,8 @@ def centerline_vtp(tree: Tree) -> bytes:
         "</PointData>",
         "<CellData>",
         *(_data_array(name, values) for name, values in cell_data.items()),
+        _data_array("NameConfidence", np.array([share for _, share in told], dtype=np.float64)),
+        _text_array("VesselName", [name for name, _ in told]),
         "</CellData>",
         "<Points>",
         _data_array("Points", tree.points().reshape(-1, 3), components=3),
@@ -125,23 +133,42 @@ def centerline_vtp(tree: Tree) -> bytes:
     return ("\n".join(out) + "\n").encode("ascii")
 
 
-def centerline_csv(tree: Tree) -> bytes:
-    """One row per centreline point; an unknown sigma is an empty field.
+def centerline_csv(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes:
+    """One row per centreline point; an unknown sigma or name is an empty field.
 
     Branches are numbered from 1, as in the pictures, the report and ``centerline.vtp``.
     """
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(
-        ["branch", "point", "arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
-    )
-    for number, branch in enumerate(tree.branches, start=1):
+    columns_of_points = ["arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
+    writer.writerow(["branch", "point", *columns_of_points, "name", "name_confidence"])
+    told = _told(tree, names)
+    for number, (branch, (name, share)) in enumerate(zip(tree.branches, told, strict=True), 1):
         columns = np.column_stack(
             [branch.arc_mm, branch.points_mm, branch.radius_mm, branch.sigma_mm, branch.confidence]
         )
         for point, row in enumerate(columns):
-            writer.writerow([number, point, *(_field(value) for value in row)])
+            fields = [_field(value) for value in row]
+            writer.writerow([number, point, *fields, name, _field(share)])
     return stream.getvalue().encode("ascii")
+
+
+def _told(tree: Tree, names: Sequence[BranchName | None]) -> list[tuple[str, float]]:
+    """Name and its probability per branch; empty and NaN where there is none."""
+    of_branch = names or [None] * len(tree.branches)
+    return [
+        ("", float("nan")) if name is None else (name.name, name.confidence)
+        for name, _ in zip(of_branch, tree.branches, strict=True)
+    ]
+
+
+def _text_array(name: str, values: Sequence[str]) -> str:
+    """Texts as VTK writes them: codes of the characters, each text ended by 0."""
+    codes = " ".join(str(code) for text in values for code in (*text.encode("ascii"), 0))
+    return (
+        f'<Array type="String" Name="{name}" NumberOfTuples="{len(values)}" format="ascii">'
+        f"{codes}</Array>"
+    )
 
 
 def _of_points(tree: Tree, name: str) -> Array:
