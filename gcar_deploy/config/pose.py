@@ -24,10 +24,8 @@ class PoseOptions:
     fine_mm: float = 0.5
     #: how well two profiles of the same tree agree, as a share of their norm
     profile_noise: float = 0.05
-    #: the same for calibrated pictures: tried one after the other, as long as what is left of the
-    #: difference is at most so many times as much (see ``profile_fit``)
-    calibrated_noises: tuple[float, ...] = (0.015, 0.005, 0.002)
-    most_left: float = 1.5
+    #: ... and how well at best in calibrated pictures (see ``profile_fit``)
+    calibrated_noise: float = 0.002
     #: calibrated pictures that agree so well as they are told are left alone: pixels, not poses
     agreed_calibrated: float = 0.002
     #: directions further apart than this are not compared: see ``estimate_poses``

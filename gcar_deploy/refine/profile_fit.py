@@ -2,9 +2,9 @@
 
 How far two profiles of one tree differ for other reasons than geometry is not known beforehand:
 in calibrated pictures it may be 0.1 % (pixels alone), in raw ones 20 %. So calibrated pictures
-are fitted with an error of 5 % first and with less and less as long as what is left of the
-difference is no larger than that. What is left then counts as one standard deviation, all of the
-profile together as one measurement: a mismatch of other causes makes the priors strong again.
+are fitted with a tenth of the difference that is left as its error, again and again as long as
+that lowers it. What is left in the end counts as one standard deviation, all of the profile
+together as one measurement: a mismatch of other causes makes the priors strong again.
 """
 
 from __future__ import annotations
@@ -20,6 +20,11 @@ from gcar_deploy.types import Array, Scalars
 
 #: relative change of the objective or of the pose below which a fit ends
 TOLERANCE = 1e-4
+#: error of the next fit, as a share of the difference that the last one left: small enough for
+#: the pictures to outweigh the priors of an angle that is 3 deg off
+TRIAL_SHARE = 0.1
+#: bound of the number of fits; each lowers what is left
+MOST_FITS = 12
 #: (pose, smoothing in mm, error of a profile) -> residuals in standard deviations
 Residuals = Callable[[Array, float, float], Scalars]
 
@@ -50,23 +55,20 @@ def fit_profiles(
     if not calibrated:
         x = fitted(start, options.coarse_mm, options.profile_noise)
         return fitted(x, options.fine_mm, options.profile_noise)
-    x, noise, before = start, options.profile_noise, left(start, options.fine_mm)
-    if before > noise:
-        x = fitted(x, options.coarse_mm, noise)
-    else:
-        noise = before
-    x = fitted(x, options.fine_mm, noise)
-    now = left(x, options.fine_mm)
-    for lower in options.calibrated_noises:
-        if lower >= noise:
-            continue
-        if now > options.min_gain * before:
+    x, now = start, left(start, options.fine_mm)
+    if now > options.profile_noise:
+        x = fitted(x, options.coarse_mm, options.profile_noise)
+        now = left(x, options.fine_mm)
+    for _ in range(MOST_FITS):
+        noise = max(TRIAL_SHARE * min(now, options.profile_noise), options.calibrated_noise)
+        trial = fitted(x, options.fine_mm, noise)
+        then = left(trial, options.fine_mm)
+        if then > options.min_gain * now:
             break  # what is left is not the pose's
-        x = fitted(x, options.fine_mm, lower)
-        before, now = now, left(x, options.fine_mm)
-        if now > options.most_left * lower:
-            return fitted(x, options.fine_mm, now)
-    return x
+        x, now = trial, then
+        if noise == options.calibrated_noise:
+            return x
+    return fitted(x, options.fine_mm, max(now, options.calibrated_noise))
 
 
 def prior_root(carm: CArm, options: PoseOptions) -> Array:

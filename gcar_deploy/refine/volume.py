@@ -61,15 +61,25 @@ CG_TOLERANCE = 2e-2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Band:
-    """Free voxels: (n, 3) index, (n, 3) mm, prior mean and sigma, (pairs) of neighbours."""
+    """Free voxels: (n, 3) index, (n, 3) mm, prior mean and sigma, and their neighbours.
+
+    ``offsets`` (o, 3) are those within ``REACH``, ``free`` (n, o) says whether the voxel there is
+    one of the n, ``column`` which one, row by row.
+    """
 
     index: Array
     points_mm: Points
     mean: Scalars
     sigma: Scalars
-    row: Array
-    col: Array
-    step: Array
+    offsets: Array
+    free: Array
+    column: Array
+
+    def matrix(self, weight: Array) -> sparse.csr_matrix:
+        """(n, n) of (n, o) weights of each voxel's neighbours."""
+        n = len(self.index)
+        pointer = np.concatenate([[0], np.cumsum(np.count_nonzero(self.free, axis=1))])
+        return sparse.csr_matrix((weight[self.free], self.column, pointer), shape=(n, n))
 
 
 def tube_volume(
@@ -152,14 +162,16 @@ def _band(
     """Voxels near the surface in a box of the grid whose first voxel is ``corner``."""
     near = blurred > BAND
     index = np.argwhere(near)
-    lookup = np.full(np.asarray(near.shape) + 2 * REACH, -1, np.int64)
-    lookup[tuple((index + REACH).T)] = np.arange(len(index))
+    room = np.asarray(near.shape) + 2 * REACH
+    stride = np.array([room[1] * room[2], room[2], 1])
+    lookup = np.full(int(room.prod()), -1, np.int32)
+    flat = (index + REACH) @ stride
+    lookup[flat] = np.arange(len(index))
     span = np.arange(-REACH, REACH + 1)
     offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
     offsets = offsets[np.linalg.norm(offsets, axis=1) <= REACH]
-    found = [lookup[tuple((index + REACH + offset).T)] for offset in offsets]
-    ok = np.stack(found) >= 0
-    which, row = np.nonzero(ok)
+    found = lookup[flat[:, None] + offsets @ stride]
+    free = found >= 0
     half = np.clip(blurred[near].astype(np.float64), 0.0, 1.0)
     sigma2 = options.floor_sigma**2 + options.surface_sigma**2 * 4 * half * (1 - half)
     index += corner
@@ -168,9 +180,9 @@ def _band(
         points_mm=grid.index2world(index),
         mean=volume[near].astype(np.float64),
         sigma=np.sqrt(sigma2),
-        row=row,
-        col=np.stack(found)[ok],
-        step=offsets[which],
+        offsets=offsets,
+        free=free,
+        column=found[free],
     )
 
 
@@ -178,16 +190,14 @@ def _correlation(band: _Band, tree: Tree, options: VolumeOptions) -> sparse.csr_
     """G with G G^T the prior covariance: Gaussian along and across the nearest vessel."""
     tangents = np.concatenate([branch.tangents for branch in tree.branches])
     nearest = cKDTree(tree.points()).query(band.points_mm)[1]
-    tangent = tangents[nearest][band.row]
-    along = np.einsum("ij,ij->i", band.step, tangent)
-    across2 = np.maximum(np.einsum("ij,ij->i", band.step, band.step) - along**2, 0.0)
+    along = tangents[nearest] @ band.offsets.T
+    across2 = np.maximum(np.einsum("ij,ij->i", band.offsets, band.offsets) - along**2, 0.0)
     weight = np.exp(
         -0.5 * ((along / options.along_voxels) ** 2 + across2 / options.across_voxels**2)
     )
-    power = np.sqrt(np.bincount(band.row, weight**2, minlength=len(band.index)))
-    weight *= (band.sigma / power)[band.row]
-    n = len(band.index)
-    return sparse.csr_matrix((weight, (band.row, band.col)), shape=(n, n))
+    weight *= band.free
+    weight *= (band.sigma / np.sqrt(np.einsum("ij,ij->i", weight, weight)))[:, None]
+    return band.matrix(weight)
 
 
 def _pictures(
@@ -258,10 +268,8 @@ def _points(
         return None
     # Trilinear deposit adds the variance of its tent, 1/6.
     width2 = sigma**2 + 1 / 6
-    weight = np.exp(-0.5 * np.einsum("ij,ij->i", band.step, band.step) / width2)
-    offsets = np.unique(band.step, axis=0)
-    whole = np.exp(-0.5 * np.einsum("ij,ij->i", offsets, offsets) / width2).sum()
-    K = sparse.csr_matrix((weight / whole, (band.row, band.col)), shape=(n, n))
+    weight = np.exp(-0.5 * np.einsum("ij,ij->i", band.offsets, band.offsets) / width2)
+    K = band.matrix(np.broadcast_to(weight / weight.sum(), band.free.shape))
     expected = K @ band.mean
     # Dropped points lower the whole density: compare shapes only.
     scale = float(density.sum() / max(expected.sum(), 1e-9))
