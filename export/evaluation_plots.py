@@ -126,7 +126,7 @@ def speed_and_error(rows: Rows) -> Figure:
     axis.set_xscale("log")
     axis.xaxis.set_major_formatter("{x:g}")
     axis.set_ylim(0, 100)
-    axis.set_xlabel("CPU time per case, s (all threads, one run on one machine)")
+    axis.set_xlabel("CPU time per case, s (all threads)")
     axis.set_ylabel("volume DSC, %")
     axis.grid(which="both", alpha=0.2)
     first = rows[0]

@@ -179,7 +179,7 @@ def made_of(made: list[Example]) -> str:
     )
 
 
-def tally(judged: Iterable[tuple[NamedTree, dict[str, Template]]]) -> dict[str, list[float]]:
+def tally(judged: Iterable[tuple[NamedTree, dict[str, Template] | None]]) -> dict[str, list[float]]:
     """Count branches by their true name (``none``: another vessel, or no right reading at all).
 
     Returns
