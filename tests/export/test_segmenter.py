@@ -15,7 +15,7 @@ from gcar_deploy.imaging.net import INPUT, Segmenter, net_input  # noqa: E402
 from gcar_deploy.imaging.segment import learned_centreline  # noqa: E402
 from gcar_deploy.predict.model_spec import read_model  # noqa: E402
 from gcar_export.angiograms import SIDE, generated_angiogram, training_pair  # noqa: E402
-from gcar_export.export_segmenter import export_segmenter  # noqa: E402
+from gcar_export.export_segmenter import _GroupNorm, export_segmenter  # noqa: E402
 from gcar_export.networks.mask_unet import MaskUNet  # noqa: E402
 from gcar_export.train_segmenter import TINY, learning_rate, train  # noqa: E402
 from tests.imaging.phantoms import angiogram, raw_picture, tube_paths  # noqa: E402
@@ -126,3 +126,12 @@ def test_lines_from_a_certain_probability():
 
 def test_size_of_the_network():
     assert 150_000 < sum(p.numel() for p in MaskUNet().parameters()) < 500_000
+
+
+def test_the_exported_norm_is_the_trained_one():
+    norm = torch.nn.GroupNorm(5, 20)
+    with torch.no_grad():
+        norm.weight.uniform_(0.5, 2.0)
+        norm.bias.uniform_(-1.0, 1.0)
+    x = 3.0 + torch.randn(1, 20, 24, 40) * torch.linspace(0.01, 5.0, 20)[None, :, None, None]
+    torch.testing.assert_close(_GroupNorm(norm)(x), norm(x), rtol=1e-4, atol=1e-5)
