@@ -11,12 +11,12 @@ from gcar_deploy.config import RunOptions
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.refine.targets import make_targets
 from gcar_deploy.selftest import tiny_case, tiny_tree
-from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_export import refine_table as refining
 from gcar_export import sigma_table as sigma
 from gcar_export.cost_curves import Curve
 from gcar_export.trees import SyntheticTree, Vessel
+from tests.export.label_files import write_tree
 
 
 def test_exponent_of_a_power_law():
@@ -41,17 +41,20 @@ def test_modes_differ_in_the_centreline_alone():
 
 
 @pytest.mark.slow
-def test_true_points_give_the_tree_back_and_noise_costs():
-    angiograms, grid, tree = tiny_case()
-    views = [extract_vessels(a, RunOptions().imaging) for a in angiograms]
-    truth = tree_occupancy(tree, grid)
-    rows = [
-        refining.one_fit(truth, grid, views, noise, refining.mode_options("tube", False))
-        for noise in (0.0, 2.0)
-    ]
-    assert rows[0].dice > 0.95 and rows[0].dice > rows[1].dice > 0.6
-    text = refining.table({("tube", False): [rows]}, (0.0, 2.0))
-    assert f"| tube | without | {100 * rows[0].dice:.1f} | {100 * rows[1].dice:.1f} |" in text
+def test_true_points_give_the_tree_back_and_noise_costs(tmp_path, monkeypatch):
+    """A tree of its own, both noises, and the second call makes nothing again."""
+    write_tree(tmp_path / "imagecas" / "5.label.nii.gz", 5)
+    monkeypatch.setattr(refining, "MODES", refining.MODES[:1])
+    calls = []
+    arguments = (tmp_path, "paper", (), (0.0, 2.0), tmp_path / "fits")
+    rows = refining.refine_rows(*arguments, on_fit=lambda: calls.append(0))
+    dice = [row.measures["dsc"] for row in rows]
+    assert dice[0] > 0.9 and dice[0] > dice[1] > 0.5
+    assert all(set(row.measures) == set(refining.MEASURES) and row.cpu_s > 0 for row in rows)
+    text = refining.table(rows, "paper")
+    assert f"| tube | without | {100 * dice[0]:.1f} | {100 * dice[1]:.1f} |" in text
+    monkeypatch.setattr(refining, "one_fit", None)
+    assert refining.refine_rows(*arguments) == rows and len(calls) == 2
 
 
 def test_errors_are_measured_from_the_true_centreline():
