@@ -104,12 +104,25 @@ def _run(arguments: list[str], verbose: bool) -> int:
     except MemoryError:
         return _fail("out of memory; use a smaller volume or smaller pictures", INTERNAL)
     except Exception as error:
+        if (stopped := _stopped(error)) is not None:
+            return _fail(*stopped)
         # The last line of defence: never a traceback.
         if verbose:
             logging.getLogger("gcar_deploy").exception("internal error")
         detail = str(error).splitlines()[0] if str(error) else ""
         return _fail(f"internal error: {type(error).__name__} {detail}; see -v".strip(), INTERNAL)
     return out if isinstance(out, int) else 0
+
+
+def _stopped(error: BaseException | None) -> tuple[str, int] | None:
+    """Tell whether a signal is behind an error: a library being loaded makes it its own."""
+    while error is not None:
+        if isinstance(error, Terminated):
+            return "terminated", TERMINATED
+        if isinstance(error, KeyboardInterrupt):
+            return "interrupted", INTERRUPTED
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def _fail(message: str, code: int) -> int:

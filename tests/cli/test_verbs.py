@@ -11,6 +11,7 @@ from importlib import resources
 
 import pytest
 
+from gcar_deploy.cli import main as entry
 from gcar_deploy.cli.main import VERBS
 from gcar_deploy.predict.model_spec import SHIPPED, shipped_model_path
 from tests.cli.conftest import gcar
@@ -155,6 +156,26 @@ def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monke
     assert done.err.startswith("gcar: error: internal error: ZeroDivisionError")
     assert "Traceback" in gcar(*run_arguments(good_case, tmp_path / "out", "-v")).err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("raised", "word", "code"),
+    [(entry.Terminated, "terminated", 143), (KeyboardInterrupt, "interrupted", 130)],
+)
+def test_a_signal_while_a_library_loads_is_a_signal(monkeypatch, capsys, raised, word, code):
+    """An extension module in whose loading a signal arrives reports an ImportError of its own."""
+
+    def load(*_, **__):
+        try:
+            raise raised
+        except BaseException as signal:
+            raise ImportError("initialization failed") from signal
+
+    monkeypatch.setattr(entry.gcar, "main", load)
+    with pytest.raises(SystemExit) as ended:
+        entry.main(["run"])
+    assert ended.value.code == code
+    assert capsys.readouterr().err == f"gcar: error: {word}\n"
 
 
 @pytest.mark.req("REQ-35")
