@@ -105,12 +105,9 @@ def reconstruct(
         )
         views = [posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
-        lattice = cubic_lattice(grid, cell_mm(grid, options))
-        seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
-        hull = visual_hull(seen, lattice, options.candidates)
-        quality.check_candidates(len(hull), lattice, options.quality)
+        hull, known = _hull(views, grid, options)
+        quality.check_candidates(len(hull), hull.lattice, options.quality)
         watch.check()
-        known = [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)]
         encoded = encode(hull, known)
     with watch.stage("centers"):
         centers, told = _centers(predictor, hull, encoded, views, known, options, watch)
@@ -166,6 +163,16 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
     """Return the edge of the lattice: the grid's own where the predictor knows such cells."""
     own = float(np.mean(grid.spacing_mm))
     return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
+
+
+def _hull(
+    views: Sequence[VesselImage], grid: Grid, options: RunOptions
+) -> tuple[Candidates, list[tuple[CArm, Image, bool]]]:
+    """Points that all views see as vessel; per view its C-arm, sampled path and calibration."""
+    lattice = cubic_lattice(grid, cell_mm(grid, options))
+    seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
+    hull = visual_hull(seen, lattice, options.candidates)
+    return hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)]
 
 
 def _centers(
@@ -287,13 +294,10 @@ def _bundled(
     """Poses of three and more views from their tree, and what the profiles say of them."""
 
     def tree_of(placed: Sequence[VesselImage]) -> Tree:
-        lattice = cubic_lattice(grid, cell_mm(grid, options))
-        seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in placed]
-        hull = visual_hull(seen, lattice, options.candidates)
+        hull, known = _hull(placed, grid, options)
         watch.check()
         if len(hull) == 0:
             return empty_tree()
-        known = [(*s, v.calibrated) for s, v in zip(seen, placed, strict=True)]
         # One look is enough to say where the views stand.
         quick = dataclasses.replace(options, predict=dataclasses.replace(options.predict, looks=1))
         encoded = encode(hull, known)

@@ -20,7 +20,7 @@ from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
-from gcar_deploy.refine.profile_fit import fit_profiles, prior_root
+from gcar_deploy.refine.profile_fit import fit_profiles, prior_root, prior_sigmas
 from gcar_deploy.types import Array, Scalars
 
 
@@ -83,7 +83,7 @@ class _Problem:
 
     @property
     def prior(self) -> Array:
-        return np.array([self.options.offset_sigma_mm] * 3 + [self.options.angle_sigma_deg] * 2)
+        return prior_sigmas(self.options)
 
     def pair(self, i: int, j: int, theta: Array) -> tuple[Mass, Mass, CArm]:
         """Both views with the correction of the first built in, and the second's C-arm."""

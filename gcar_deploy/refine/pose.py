@@ -26,7 +26,7 @@ from gcar_deploy.geometry.consistency import (
 )
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.refine.joint_pose import corrected, estimate_jointly
-from gcar_deploy.refine.profile_fit import fit_profiles, prior_root
+from gcar_deploy.refine.profile_fit import fit_profiles, prior_root, prior_sigmas
 from gcar_deploy.types import Array, Image, Pixels
 
 
@@ -187,7 +187,7 @@ def _estimate(
     apart = mismatch(fixed, moving, moving.carm, options.fine_mm)
     if not options.enabled or (calibrated and gap is None and apart <= options.agreed_calibrated):
         return given
-    prior = np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+    prior = prior_sigmas(options)
     root = prior_root(moving.carm, options)
 
     def residuals(theta: Array, sigma_mm: float, noise: float) -> Array:

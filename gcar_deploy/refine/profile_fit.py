@@ -71,6 +71,11 @@ def fit_profiles(
     return fitted(x, options.fine_mm, max(now, options.calibrated_noise))
 
 
+def prior_sigmas(options: PoseOptions) -> Array:
+    """(5,) standard deviations of a view's correction: offset x, y, z in mm, two angles in deg."""
+    return np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+
+
 def prior_root(carm: CArm, options: PoseOptions) -> Array:
     """(5, 5) W with W theta standard normal under the prior of a view's correction.
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
+import shutil
+import subprocess
 import threading
 import urllib.error
 import urllib.request
@@ -130,3 +133,15 @@ def serving(make_queue, good_case, tmp_path):  # noqa: F811 - the imported fixtu
 @pytest.fixture
 def case_folder(good_case) -> Path:  # noqa: F811
     return good_case
+
+
+def dcmtk(name: str) -> str | None:
+    """Return DCMTK's own tool: pynetdicom installs scripts of the same names."""
+    for place in os.get_exec_path():
+        path = shutil.which(name, path=place)
+        if path is None:
+            continue
+        said = subprocess.run([path, "--version"], capture_output=True, text=True, check=False)
+        if "$dcmtk" in said.stdout:
+            return path
+    return None

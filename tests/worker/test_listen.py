@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -29,6 +27,7 @@ from gcar_deploy.selftest import tiny_tree
 from gcar_deploy.worker.jobs import JobQueue
 from gcar_deploy.worker.listen import Listener, tell
 from tests.dicom.files import classic, save
+from tests.worker.conftest import dcmtk
 
 VERIFICATION = "1.2.840.10008.1.1"
 SIDE = 256
@@ -142,21 +141,9 @@ def test_wrong_calls(tmp_path, listening):
         Listener(queue, tmp_path, title="GCAR").start(port)
 
 
-def dcmtk_storescu() -> str | None:
-    """Return DCMTK's own storescu: pynetdicom installs a script of the same name."""
-    for folder in os.get_exec_path():
-        path = shutil.which("storescu", path=folder)
-        if path is None:
-            continue
-        said = subprocess.run([path, "--version"], capture_output=True, text=True, check=False)
-        if "$dcmtk" in said.stdout:
-            return path
-    return None
-
-
 SENDERS = {
     "pynetdicom": [sys.executable, "-m", "pynetdicom", "storescu"],
-    "dcmtk": [dcmtk_storescu()],
+    "dcmtk": [dcmtk("storescu")],
 }
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -32,6 +30,7 @@ from gcar_deploy.selftest import tiny_tree
 from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 from gcar_deploy.worker.send import Peer, parse_peer, sent_back
 from tests.dicom.files import classic, save
+from tests.worker.conftest import dcmtk
 from tests.worker.test_listen import runs  # noqa: F401 - a fixture
 
 BOTH = (EncapsulatedSTLStorage, SecondaryCaptureImageStorage)
@@ -150,18 +149,6 @@ def test_peers_that_are_none(text):
 def test_peers():
     assert parse_peer("PACS@10.0.0.7:104") == Peer("PACS", "10.0.0.7", 104)
     assert str(parse_peer("A-1@archive.local:11112")) == "A-1@archive.local:11112"
-
-
-def dcmtk(name: str) -> str | None:
-    """Return DCMTK's own tool: pynetdicom installs scripts of the same names."""
-    for place in os.get_exec_path():
-        path = shutil.which(name, path=place)
-        if path is None:
-            continue
-        said = subprocess.run([path, "--version"], capture_output=True, text=True, check=False)
-        if "$dcmtk" in said.stdout:
-            return path
-    return None
 
 
 def started_archive(command, folder):
