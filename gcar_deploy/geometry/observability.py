@@ -26,7 +26,7 @@ ALONG_BEAM_DEG = 5.0
 #: bounds between the classes, in units of the noise at the isocentre
 WEAK, NONE = 3.0, 10.0
 #: profiles of calibrated pictures that agree so well (``consistency.disagreement``) rule out an
-#: angle error of a degree, which makes it 0.006 to 0.012 in three real trees (0.0005 without)
+#: angle error of a degree, which makes them differ by more
 EXACT_DISAGREEMENT = 0.003
 #: an error counts as silent if the pictures show less than this share of its effect
 SILENT_SHARE = 0.05
