@@ -64,6 +64,9 @@ def enhance(
 ) -> None:
     r"""Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
 
+    And steps.png: the vesselness with the skeleton in green and, in red, what was taken for a
+    catheter and left out.
+
     \b
     Example:
       gcar enhance view1.png --out steps
@@ -103,5 +106,6 @@ def enhance(
     length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
     click.echo(
         f"{out_dir}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "
-        f"skeleton.png (about {length_mm:.0f} mm)"
+        f"skeleton.png (about {length_mm:.0f} mm), steps.png ({found.catheter_mm:.0f} mm taken "
+        "for catheter)"
     )

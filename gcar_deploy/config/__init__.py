@@ -6,6 +6,7 @@ import dataclasses
 from typing import TypeAlias
 
 from gcar_deploy.config.pictures import (
+    CatheterOptions,
     DicomLimits,
     DicomOptions,
     ImagingOptions,
@@ -31,6 +32,7 @@ from gcar_deploy.config.refine import (
 __all__ = [
     "BundleOptions",
     "CandidateOptions",
+    "CatheterOptions",
     "DecideOptions",
     "DicomLimits",
     "DicomOptions",

@@ -50,6 +50,39 @@ class DicomOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class CatheterOptions:
+    """What counts as a catheter among the lines found. Millimetres at the isocentre."""
+
+    #: False keeps every line
+    reject: bool = True
+    #: a catheter comes within this distance of the border of the field
+    border_mm: float = 3.0
+    #: from the border to the tip; a side branch shorter than ``spur_mm`` is none
+    shortest_mm: float = 5.0
+    longest_mm: float = 80.0
+    spur_mm: float = 8.0
+    #: width at half height, blur included (8 F are 2.7 mm), and its standard deviation along
+    #: the catheter as a share of it
+    widest_mm: float = 4.2
+    unevenness: float = 0.06
+    #: the vessel beyond the tip is this many times wider, its narrow places (lower 30 %) too
+    step: float = 1.5
+    least_step: float = 1.1
+    #: and it is a main one: its width as a share of the 90th percentile of all
+    vessel_share: float = 0.6
+    #: no vessel goes through the place where it ends: two arms at least this wide (share of the
+    #: widest) and this straight
+    arm_share: float = 0.65
+    through_deg: float = 150.0
+    #: a line from border to border as long as this share of the picture's shorter side that
+    #: stays this close to its chord (90 % of it) is a lead or a wire
+    crossing_share: float = 0.6
+    crossing_off_mm: float = 4.0
+    #: more of the line than this is never taken for catheters
+    largest_share: float = 0.25
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ImagingOptions:
     """From a picture to vessel mask, skeleton and path length. Millimetres at the isocentre."""
 
@@ -86,6 +119,7 @@ class ImagingOptions:
     weak_share: float = 0.4
     #: a straight line as long as this share of the shorter side is a wire or an edge
     straight_share: float = 0.6
+    catheter: CatheterOptions = dataclasses.field(default_factory=CatheterOptions)
     #: rim of the mask: this many noise deviations, but within these shares of the peak
     rim_noise: float = 9.0
     rim_low: float = 0.15

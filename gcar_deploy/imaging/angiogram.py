@@ -110,6 +110,10 @@ class VesselImage:
         ``path_length``, ``attenuation`` or ``raw``.
     vesselness : (rows, cols) float32 or None
         Ridge response; None where the picture needed no enhancement.
+    catheter : (rows, cols) bool or None
+        What was taken for a catheter and left out of the mask; None where nobody looked.
+    catheter_mm : float
+        Length of its line.
     """
 
     view_id: str
@@ -121,10 +125,13 @@ class VesselImage:
     valid: Mask
     kind: str
     vesselness: Image | None = None
+    catheter: Mask | None = None
+    catheter_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        for array in (self.path_mm, self.mask, self.skeleton, self.valid):
-            _check_shape(self.view_id, self.carm, array)
+        for array in (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter):
+            if array is not None:
+                _check_shape(self.view_id, self.carm, array)
 
 
 def _check_shape(view_id: str, carm: CArm, array: Image | Mask) -> None:

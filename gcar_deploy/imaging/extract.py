@@ -125,6 +125,11 @@ def _from_grey(
         found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm, options)
     else:
         found = segment.segment(search, holes, pixel_mm, options, segmenter)
+    if found.catheter_mm > 0:
+        _log.info(
+            "view %s: %.0f mm of line taken for a catheter and left out",
+            angiogram.view_id, found.catheter_mm,
+        )  # fmt: skip
     length = found.skeleton.sum() * pixel_mm
     too_faint = found.contrast < options.min_contrast or found.peak < options.min_peak
     too_faint &= angiogram.mask is None  # who draws a mask has seen the vessel
@@ -158,6 +163,8 @@ def _from_grey(
         valid=found.valid,
         kind=kind,
         vesselness=found.vesselness,
+        catheter=found.catheter if angiogram.mask is None else None,
+        catheter_mm=found.catheter_mm,
     )
 
 

@@ -36,7 +36,9 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     mask = (area_average(old.mask.astype(np.float32), rows, columns) >= 0.5) | line
     mask &= path > 0
     valid = area_average(old.valid.astype(np.float32), rows, columns) >= 0.5
-    response = old.vesselness
+    response, catheter = old.vesselness, old.catheter
+    if catheter is not None:
+        catheter = (area_average(catheter.astype(np.float32), rows, columns) >= 0.5) & ~mask
     return dataclasses.replace(
         old,
         carm=old.carm.resized(rows, columns),
@@ -45,6 +47,7 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
         skeleton=skel.skeletonize(mask),
         valid=valid,
         vesselness=None if response is None else area_average(response, rows, columns),
+        catheter=catheter,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.net import Segmenter, net_input
 from gcar_deploy.types import Array, Image, Mask
 
@@ -28,6 +29,10 @@ class Segmentation:
         Mean rise of the skeleton above the background, units of the picture.
     contrast : float
         ``peak`` over the noise beside the vessels. Both are 0 where nothing was found.
+    catheter : (rows, cols) bool
+        Lines taken for catheters, as wide as they look; no part of the mask.
+    catheter_mm : float
+        Their length.
     """
 
     mask: Mask
@@ -37,6 +42,8 @@ class Segmentation:
     rim_share: Image
     peak: float
     contrast: float
+    catheter: Mask
+    catheter_mm: float
 
 
 def segment(
@@ -73,6 +80,12 @@ def segment(
     else:
         sure = segmenter.probability(net_input(flat, response, ~work_holes))
         line = learned_centreline(sure, ~work_holes, work_mm, options)
+    taken = np.zeros_like(line)
+    if options.catheter.reject:
+        taken = catheters(line, flat, found.sigma_px, ~work_holes, work_mm, options.catheter)
+    if taken.any():
+        line = skel.strong_parts(line & ~taken, response, options.part_share)
+    device = _drawn_lines(taken, found.sigma_px)
     full = (columns, rows)
     vesselness = np.where(holes, np.float32(0), resize(response, full))
     if not line.any():
@@ -80,9 +93,9 @@ def segment(
         share = np.zeros((rows, columns), np.float32)
         return Segmentation(
             mask=nothing, skeleton=nothing, valid=~holes, vesselness=vesselness,
-            rim_share=share, peak=0.0, contrast=0.0,
+            rim_share=share, peak=0.0, contrast=0.0, catheter=nothing, catheter_mm=0.0,
         )  # fmt: skip
-    rim = _rim(work, flat, line, found.sigma_px, work_mm, options)
+    rim = _rim(work, flat, line, device, found.sigma_px, work_mm, options)
     mask = _draw(picture, holes, line, rim, pixel_mm)
     return Segmentation(
         mask=mask,
@@ -92,6 +105,8 @@ def segment(
         rim_share=resize(rim.share, full),
         peak=rim.peak,
         contrast=rim.contrast,
+        catheter=(resize(device.astype(np.float32), full) > 0.5) & ~mask,
+        catheter_mm=int(taken.sum()) * work_mm,
     )
 
 
@@ -150,6 +165,8 @@ def given(
         rim_share=np.zeros(picture.shape, np.float32),
         peak=peak,
         contrast=peak / max(_noise_beside(rise, mask), 1e-12) if line.any() else 0.0,
+        catheter=np.zeros_like(mask),
+        catheter_mm=0.0,
     )
 
 
@@ -182,8 +199,22 @@ class _Rim:
     contrast: float
 
 
+def _drawn_lines(line: Mask, sigma_px: Image) -> Mask:
+    """Lines at the width where the ridge filter answered most."""
+    if not line.any():
+        return line
+    distance, (sigma,) = skel.spread(line, (sigma_px,), 3.0)
+    return distance <= 1.0 + sigma
+
+
 def _rim(
-    work: Image, flat: Image, line: Mask, sigma_px: Image, pixel_mm: float, options: ImagingOptions
+    work: Image,
+    flat: Image,
+    line: Mask,
+    device: Mask,
+    sigma_px: Image,
+    pixel_mm: float,
+    options: ImagingOptions,
 ) -> _Rim:
     """Set the rim's level between noise and peak.
 
@@ -197,9 +228,10 @@ def _rim(
     # First the whole reach counts as vessel, then what the first rim encloses.
     grown = room > 0
     for _ in range(2):
-        ground = enhance.background(flat, grown, margin, fill)
+        # A catheter is no vessel, but no background either.
+        ground = enhance.background(flat, grown | device, margin, fill)
         rise = cv2.GaussianBlur(flat - ground, (0, 0), 0.8)
-        noise = _noise_beside(rise, grown)
+        noise = _noise_beside(rise, grown | device)
         _, (peak,) = skel.spread(line, (rise,), 3.0)
         peak = np.maximum(peak, 1e-12)
         level = np.clip(options.rim_noise * noise, options.rim_low * peak, options.rim_high * peak)

@@ -21,13 +21,14 @@ def picture(tmp_path):
     return path
 
 
-def test_three_pictures_at_the_size_of_the_first(tmp_path, picture):
+def test_four_pictures_at_the_size_of_the_first(tmp_path, picture):
     out = tmp_path / "deep" / "steps"
     done = _run(picture, "--out", out, "--pixel-mm", 0.3)
     assert done.exit_code == 0, done.output
-    assert sorted(p.name for p in out.iterdir()) == ["mask.png", "skeleton.png", "vesselness.png"]
+    names = ["mask.png", "skeleton.png", "steps.png", "vesselness.png"]
+    assert sorted(p.name for p in out.iterdir()) == names
     for path in out.iterdir():
-        assert cv2.imread(str(path), -1).shape == (256, 256)
+        assert cv2.imread(str(path), -1).shape[:2] == (256, 256)
     assert [p.name for p in out.parent.iterdir()] == ["steps"]
 
 
@@ -38,7 +39,7 @@ def test_existing_folder_needs_force(tmp_path, picture):
     assert isinstance(_run(picture, "--out", out).exception, UsageError)
     assert (out / "mine.txt").exists()
     assert _run(picture, "--out", out, "--force").exit_code == 0
-    assert len(list(out.iterdir())) == 3
+    assert len(list(out.iterdir())) == 4
 
 
 def test_nothing_is_written_on_refusal(tmp_path):

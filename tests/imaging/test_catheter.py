@@ -1,0 +1,168 @@
+"""Scenes whose catheter is known: it goes, and vessels that reach the border stay."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+import cv2
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from gcar_deploy.config import CatheterOptions, ImagingOptions
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.linegraph import LineGraph
+from gcar_deploy.imaging.pictures import vessel_pictures
+from gcar_deploy.imaging.resample import resized
+from gcar_deploy.imaging.skeleton import skeletonize
+from tests.imaging.phantoms import angiogram, raw_picture
+
+_SIDE, _MM, _FINE = 240, 0.5, 4
+_OPTIONS = ImagingOptions()
+_KEPT = dataclasses.replace(_OPTIONS, catheter=CatheterOptions(reject=False))
+
+#: (col, row) px through which a smooth tube runs, and its radius at both ends, mm
+_MAIN = ([(78, 70), (110, 62), (150, 85), (165, 130), (150, 180)], 1.9, 1.3)
+_SIDE_BRANCH = ([(150, 85), (190, 95), (205, 130)], 1.0, 0.7)
+_SECOND_BRANCH = ([(165, 130), (130, 150), (90, 190)], 1.0, 0.7)
+_TREE = (_MAIN, _SIDE_BRANCH, _SECOND_BRANCH)
+_CATHETERS = {
+    "from above": ([(60, -8), (52, 30), (58, 60), (78, 70)], 0.9, 0.9),
+    "from the side": ([(-8, 40), (25, 42), (55, 58), (78, 70)], 0.8, 0.8),
+    "in a loop": ([(120, -8), (75, 5), (48, 35), (55, 66), (78, 70)], 1.0, 1.0),
+}
+#: vessels that leave the field: a main one, zoomed in; the tapering end of one; a side branch
+#: of one that goes on to both sides
+_LEAVING = {
+    "zoomed": (([(-8, 60), (60, 66), (120, 80), (160, 130), (170, 190)], 2.0, 1.2), _SIDE_BRANCH),
+    "tapering": (([(60, 60), (110, 70), (150, 120), (190, 180), (215, 250)], 1.9, 0.9),),
+    "side branch": (
+        ([(20, 170), (80, 140), (140, 120), (200, 110), (225, 60)], 1.8, 1.4),
+        ([(120, 125), (105, 70), (110, 30), (100, -8)], 0.9, 0.8),
+    ),
+}
+
+
+def _tubes(tubes, side=_SIDE):
+    """(side, side) mean chord, mm, of tubes in the plane of the detector."""
+    path = np.zeros((side * _FINE,) * 2, np.float32)
+    for points, first, last in tubes:
+        points = np.asarray(points, float)
+        t = np.r_[0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
+        at = np.linspace(0, t[-1], 1000)
+        curve = np.rint(CubicSpline(t, points)(at) * _FINE + 0.5 * (_FINE - 1)).astype(int)
+        free = np.ones((side * _FINE + 200,) * 2, np.uint8)
+        radius = np.zeros(free.shape, np.float32)
+        inside = ((curve > -100) & (curve < side * _FINE + 100)).all(axis=1)
+        column, row = curve[inside].T + 100
+        free[row, column], radius[row, column] = 0, np.linspace(first, last, 1000)[inside]
+        gap, label = cv2.distanceTransformWithLabels(
+            free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        table = np.zeros(label.max() + 1, np.float32)
+        table[label[free == 0]] = radius[free == 0]
+        chord = 2 * np.sqrt(np.clip(table[label] ** 2 - (gap * _MM / _FINE) ** 2, 0, None))
+        path = np.maximum(path, chord[100:-100, 100:-100])
+    return cv2.resize(path, (side, side), interpolation=cv2.INTER_AREA)
+
+
+def _found(tubes, options=_OPTIONS, seed=0):
+    return extract_vessels(angiogram(raw_picture(_tubes(tubes), seed=seed), pixel_mm=_MM), options)
+
+
+def _dice(a, b):
+    return 2 * (a & b).sum() / (a.sum() + b.sum())
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", sorted(_CATHETERS))
+def test_a_catheter_goes_and_the_vessels_stay(name, seed):
+    tube = _CATHETERS[name]
+    found, clean = _found((*_TREE, tube), seed=seed), _found(_TREE, seed=seed)
+    own = skeletonize(_tubes([tube]) > 0)
+    row, column = np.indices(own.shape)
+    own &= np.hypot(column - 78, row - 70) * _MM > 5.0  # what is blurred into the ostium
+    assert (found.mask & own).sum() < 0.1 * own.sum()
+    assert (found.catheter & own).sum() > 0.8 * own.sum()
+    assert not (found.catheter & found.mask).any()
+    assert found.catheter_mm == pytest.approx(own.sum() * _MM, rel=0.4)
+    assert _dice(found.mask, clean.mask) > 0.94
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", sorted(_LEAVING))
+def test_a_vessel_that_leaves_the_field_stays(name, seed):
+    found, kept = _found(_LEAVING[name], seed=seed), _found(_LEAVING[name], _KEPT, seed)
+    assert found.catheter_mm == 0 and not found.catheter.any()
+    np.testing.assert_array_equal(found.mask, kept.mask)
+
+
+def test_a_lead_across_the_field_goes():
+    lead = ([(30, -8), (74, 80), (114, 160), (160, 248)], 0.7, 0.7)
+    tree = [([(x + 60, y) for x, y in points], a, b) for points, a, b in (_MAIN,)]
+    with_lead, clean = _found((*tree, lead)), _found(tree)
+    own = skeletonize(_tubes([lead]) > 0)
+    assert (with_lead.mask & own).sum() < 0.1 * own.sum()
+    assert _dice(with_lead.mask, clean.mask) > 0.9
+
+
+def test_switched_off_every_line_stays():
+    tube = _CATHETERS["from above"]
+    found = _found((*_TREE, tube), _KEPT)
+    own = skeletonize(_tubes([tube]) > 0)
+    assert (found.mask & own).sum() > 0.85 * own.sum()
+    assert found.catheter_mm == 0 and not found.catheter.any()
+
+
+def test_most_of_the_line_is_never_taken_away():
+    # a long catheter before one vessel
+    scene = [_MAIN, _CATHETERS["in a loop"]]
+    assert _found(scene).catheter_mm == 0
+    more = dataclasses.replace(_OPTIONS.catheter, largest_share=0.9)
+    assert _found(scene, dataclasses.replace(_OPTIONS, catheter=more)).catheter_mm > 35
+
+
+@pytest.mark.parametrize("scene", ["from above", "in a loop", "zoomed", "side branch"])
+def test_turned_and_mirrored_pictures_decide_alike(scene):
+    tubes = (*_TREE, _CATHETERS[scene]) if scene in _CATHETERS else _LEAVING[scene]
+    picture = raw_picture(_tubes(tubes), ramp=0.0)
+    upright = extract_vessels(angiogram(picture, pixel_mm=_MM), _OPTIONS)
+    assert (upright.catheter_mm > 0) == (scene in _CATHETERS)
+    for mirrored in (False, True):
+        for quarter in range(4):
+            turned = np.rot90(picture[:, ::-1] if mirrored else picture, quarter)
+            found = extract_vessels(angiogram(turned.copy(), pixel_mm=_MM), _OPTIONS)
+            back = np.rot90(found.catheter, -quarter)
+            back = back[:, ::-1] if mirrored else back
+            assert found.catheter_mm == pytest.approx(upright.catheter_mm, abs=4.0)
+            if upright.catheter_mm > 0:
+                assert _dice(back, upright.catheter) > 0.85
+
+
+def test_it_is_said_and_drawn(caplog):
+    with caplog.at_level(logging.INFO):
+        found = _found((*_TREE, _CATHETERS["from above"]))
+    assert f"{found.catheter_mm:.0f} mm of line taken for a catheter" in caplog.text
+    steps = vessel_pictures(found)["steps.png"]
+    colours = steps[found.catheter & ~found.skeleton]
+    assert (colours == colours[0]).all() and colours[0, 2] > 2 * colours[0, :2].max()
+    assert (steps[found.skeleton] == steps[found.skeleton][0]).all()
+    half = resized(found, _SIDE // 2, _SIDE // 2)
+    assert half.catheter.sum() == pytest.approx(found.catheter.sum() / 4, rel=0.2)
+
+
+def test_the_graph_of_a_line():
+    line = np.zeros((9, 12), bool)
+    line[4, 1:11] = line[2:4, 5] = True  # ten pixels, and two that hang on the fifth
+    line[5, 10] = True  # a corner, no fork
+    graph = LineGraph(line)
+    assert graph.ends(np.ones_like(line)) == [(2, 5), (4, 1), (5, 10)]
+    path, spurs = graph.walk((4, 1), spur_px=4, longest_px=99)
+    assert path[0] == (4, 1) and path[-1] == (5, 10) and spurs == {(2, 5), (3, 5)}
+    stopped, _ = graph.walk((4, 1), spur_px=1, longest_px=99)
+    assert stopped[-1] == (4, 5)
+    far = graph.distances((4, 1), 100, ())
+    assert far[5, 10] == pytest.approx(10) and far[2, 5] == pytest.approx(6)
+    assert graph.shortest(far, (2, 5)) == [(4, 1), (4, 2), (4, 3), (4, 4), (4, 5), (3, 5), (2, 5)]
+    assert len(graph.branches(far, 5, 6)) == 2
