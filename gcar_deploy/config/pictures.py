@@ -124,6 +124,11 @@ class ImagingOptions:
     rim_noise: float = 9.0
     rim_low: float = 0.15
     rim_high: float = 0.65
+    #: the upper one is ``rim_high_in_grain`` where a blur of ``grain_mm`` leaves less than the
+    #: first of these shares of the noise, and ``rim_high`` where it leaves more than the second
+    rim_high_in_grain: float = 0.45
+    grain_mm: float = 1.0
+    grain_left: tuple[float, float] = (0.55, 0.65)
     #: farthest rim, in units of the ridge filter's sigma
     reach_sigmas: float = 1.6
     #: filled-in background: margin left round the vessels, and width of the fill

@@ -234,7 +234,8 @@ def _rim(
         noise = _noise_beside(rise, grown | device)
         _, (peak,) = skel.spread(line, (rise,), 3.0)
         peak = np.maximum(peak, 1e-12)
-        level = np.clip(options.rim_noise * noise, options.rim_low * peak, options.rim_high * peak)
+        high = _highest_rim(rise, grown | device, noise, pixel_mm, options)
+        level = np.clip(options.rim_noise * noise, options.rim_low * peak, high * peak)
         grown = ((rise > level) & (room > 0)) | line
     return _Rim(
         ground=work - flat + ground,
@@ -244,6 +245,19 @@ def _rim(
         peak=float(peak[line].mean()),
         contrast=float(peak[line].mean() / max(noise, 1e-12)),
     )
+
+
+def _highest_rim(
+    rise: Array, found: Mask, noise: float, pixel_mm: float, options: ImagingOptions
+) -> float:
+    """Highest level of the rim as a share of the peak, by what the noise is made of.
+
+    Structure of the background passes for vessel if the rim is low; fine grain only makes the
+    rim ragged. What a blur leaves of the noise is structure.
+    """
+    blurred = cv2.GaussianBlur(rise, (0, 0), max(0.5, options.grain_mm / pixel_mm))
+    left = _noise_beside(blurred, found) / max(noise, 1e-12)
+    return float(np.interp(left, options.grain_left, (options.rim_high_in_grain, options.rim_high)))
 
 
 def _noise_beside(rise: Array, vessel: Mask) -> float:
