@@ -147,8 +147,20 @@ def _print_expert(pairs: Sequence[Path], each: bool, net: Segmenter | None) -> N
     if each:
         for picture, scores in rows.items():
             print(_line(picture, scores))
-    for label, reduce in (("mean", np.mean), ("worst", np.min)):
-        print(_line(label, {n: float(reduce([r[n] for r in rows.values()])) for n in names}))
+    halves = {
+        "mean": (np.mean, rows),
+        "mean, odd numbers (options were chosen with them)": (np.mean, _numbered(rows, 1)),
+        "mean, even numbers": (np.mean, _numbered(rows, 0)),
+        "worst": (np.min, rows),
+    }
+    for label, (reduce, some) in halves.items():
+        if some:
+            print(_line(label, {n: float(reduce([r[n] for r in some.values()])) for n in names}))
+
+
+def _numbered(rows: dict[str, dict[str, float]], rest: int) -> dict[str, dict[str, float]]:
+    """Pictures whose name is a number with this remainder after division by two."""
+    return {name: r for name, r in rows.items() if name.isdigit() and int(name) % 2 == rest}
 
 
 def _print_cases(cases: Path, net: Segmenter | None) -> None:

@@ -75,9 +75,9 @@ class CatheterOptions:
     arm_share: float = 0.65
     through_deg: float = 150.0
     #: a line from border to border as long as this share of the picture's shorter side that
-    #: stays this close to its chord (90 % of it) is a lead or a wire
+    #: stays close to its chord (90 % of it, as a share of the chord) is a lead or a wire
     crossing_share: float = 0.6
-    crossing_off_mm: float = 4.0
+    crossing_off_share: float = 0.025
     #: more of the line than this is never taken for catheters
     largest_share: float = 0.25
 

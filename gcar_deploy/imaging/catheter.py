@@ -72,10 +72,12 @@ def catheters(
         return found
     width = line_widths(line, flat, sigma_px, pixel_mm)
     widest = float(np.quantile(width[line], 0.9))
-    for pixels in _crossings(graph, ends, min(line.shape), pixel_mm, options):
+    for pixels in _crossings(graph, ends, min(line.shape), options):
         found[tuple(np.transpose(pixels))] = True
     crossing = found
-    cuts = [_cut(graph, end, width, widest, pixel_mm, options) for end in ends if not found[end]]
+    cuts = [
+        _cut(graph, end, width, widest, inward, pixel_mm, options) for end in ends if not found[end]
+    ]
     # The clearest first, as long as most of the line stays.
     for _, pixels in sorted((c for c in cuts if c is not None), reverse=True):
         tried = found.copy()
@@ -86,7 +88,7 @@ def catheters(
 
 
 def _crossings(
-    graph: LineGraph, ends: list[Pixel], side_px: int, pixel_mm: float, options: CatheterOptions
+    graph: LineGraph, ends: list[Pixel], side_px: int, options: CatheterOptions
 ) -> list[list[Pixel]]:
     """Lines from border to border that stay close to their chord: longer than any vessel does."""
     found = []
@@ -101,10 +103,11 @@ def _crossings(
             if other not in reached:
                 continue
             path = graph.shortest(reached, other)
-            chord = np.subtract(other, one) / np.hypot(*np.subtract(other, one))
+            chord = np.subtract(other, one)
             row, column = (np.asarray(path) - one).T
-            off = np.abs(row * chord[1] - column * chord[0]) * pixel_mm
-            if np.sort(off)[len(off) * 9 // 10] <= options.crossing_off_mm:
+            # distance from the chord as a share of the chord
+            off = np.abs(row * chord[1] - column * chord[0]) / (chord @ chord)
+            if np.sort(off)[len(off) * 9 // 10] <= options.crossing_off_share:
                 found.append(path)
     return found
 
@@ -154,6 +157,7 @@ def _cut(
     end: Pixel,
     width: Image,
     widest: float,
+    inward: Image,
     pixel_mm: float,
     options: CatheterOptions,
 ) -> tuple[float, list[Pixel]] | None:
@@ -172,7 +176,10 @@ def _cut(
     before_mm = width[tuple(np.transpose(path))]
     del beyond[path[-1]]
     place = np.r_[along, [along[-1] + d * pixel_mm for d in beyond.values()]]
-    all_mm = np.r_[before_mm, [width[p] for p in beyond]]
+    all_at = tuple(np.transpose([*path, *beyond]))
+    all_mm = width[all_at]
+    # A line that leaves the field looks wider at its border: no place for an ostium.
+    place[inward[all_at] < options.border_mm] = -np.inf
     best: tuple[float, float] | None = None
     for cut in np.arange(options.shortest_mm, along[-1] + 0.5, 1.0):
         if passes and along[-1] < cut + 0.75 * _AFTER_MM[1]:
