@@ -91,3 +91,25 @@ def test_straight_wire_goes_and_a_bent_vessel_stays():
     left = segment._without_wires(both > 0, 0.6)
     assert (left & (vessel > 0)).sum() >= 0.98 * (vessel > 0).sum()
     assert left[:, 165:].sum() < 20  # of 200
+
+
+def _noisy_tube(blur_px: float) -> np.ndarray:
+    noise = np.random.default_rng(6).standard_normal((256, 256))
+    noise = cv2.GaussianBlur(noise, (0, 0), blur_px) if blur_px else noise
+    return raw_picture(tube_paths(radius_mm=1.8), noise=0.0) + 12.0 * noise / noise.std()
+
+
+@pytest.mark.parametrize("blur_px, grain", [(0.0, True), (6.0, False)])
+def test_the_rim_goes_lower_in_grain_than_in_structure(blur_px, grain):
+    found = {}
+    for share in (0.45, 0.65):
+        options = ImagingOptions(rim_high_in_grain=share)
+        picture = enhance.absorbance(_noisy_tube(blur_px).astype(np.float32), options.log_offset)
+        holes = np.zeros(picture.shape, bool)
+        found[share] = segment.segment(picture, holes, PIXEL_MM, options)
+    if not grain:
+        np.testing.assert_array_equal(found[0.45].mask, found[0.65].mask)
+        return
+    truth = tube_paths(radius_mm=1.8) > 0.9
+    low, high = ((found[s].mask & truth).sum() / truth.sum() for s in (0.45, 0.65))
+    assert low > high + 0.05
