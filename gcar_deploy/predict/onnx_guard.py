@@ -3,8 +3,9 @@
 A model is a program: its graph may loop, draw random numbers, call operators of other vendors
 or name files elsewhere on the disk. Here the file's own structure (protocol buffers, as laid
 down in ``onnx.proto``) is walked byte by byte, and everything that a feed-forward network of
-this project does not need is refused. Nothing is built or run. Functions raise ``ValueError``
-with the end of a sentence; ``read_model`` puts the name of the file in front.
+this project does not need is refused. Nothing is built or run; how large the graph's constants
+become is reckoned in ``onnx_constants``. Functions raise ``ValueError`` with the end of a
+sentence; ``read_model`` puts the name of the file in front.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gcar_deploy.config import ModelLimits
+from gcar_deploy.predict.onnx_constants import MOST_VALUES, Constant, Node, check_constants
 
 #: operators that compute values from values: no control flow (Loop, If, Scan), nothing random,
 #: no text, sequences or optional values, and no scatters, whose repeated indices race
@@ -51,6 +53,8 @@ _TYPES: dict[int, tuple[int, str | None]] = {
     1: (4, "<f4"), 2: (1, None), 3: (1, None), 6: (4, None), 7: (8, None), 9: (1, None),
     10: (2, "<f2"), 11: (8, "<f8"),
 }  # fmt: skip
+#: types whose small tensors may be sizes: NumPy types of their raw data
+_RAW_NUMBERS = {1: "<f4", 2: "u1", 3: "i1", 6: "<i4", 7: "<i8", 10: "<f2", 11: "<f8"}
 #: bytes of packed whole numbers, which take longer to count than raw data
 _MAX_PACKED = 2**20
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
@@ -76,7 +80,8 @@ def check_onnx(data: bytes, limits: ModelLimits) -> None:
     ------
     ValueError
         Not ONNX; external data; an operator, domain or opset that is not allowed; a graph
-        within the graph; a tensor whose size is not that of its data; weights not finite.
+        within the graph; a tensor whose size is not that of its data; weights not finite;
+        constants that become too large.
     """
     walk, graphs = _Walk(limits), 0
     for number, value in _message(walk, "model", memoryview(data), _MODEL_FIELDS):
@@ -90,19 +95,27 @@ def check_onnx(data: bytes, limits: ModelLimits) -> None:
 
 
 def _check_graph(data: memoryview, walk: _Walk) -> None:
-    nodes = elements = 0
+    elements = 0
+    nodes: list[Node] = []
+    weights: dict[str, Constant] = {}
     for number, value in _message(walk, "graph", data, _GRAPH_FIELDS):
         if number == 1:
-            nodes += 1
-            elements += _check_node(_bytes(value), walk)
+            nodes.append(_check_node(_bytes(value), walk))
+            held = nodes[-1].value
+            elements += 0 if held is None else held.elements
         elif number == 5:
-            elements += _check_tensor(_bytes(value), walk, finite=True)
-        if nodes > walk.limits.max_nodes:
+            name, held = _check_tensor(_bytes(value), walk, finite=True)
+            elements += held.elements
+            if name in weights:
+                raise ValueError(f"has two weights of the name {name[:40]!r}")
+            weights[name] = held
+        if len(nodes) > walk.limits.max_nodes:
             raise ValueError(f"has more than {walk.limits.max_nodes} nodes")
         if elements > walk.limits.max_elements:
             raise ValueError(f"has more than {walk.limits.max_elements} weights")
     if not nodes:
         raise ValueError(_DAMAGED)
+    check_constants(weights, nodes, walk.limits.max_elements)
 
 
 def _check_opset(data: memoryview, walk: _Walk) -> None:
@@ -118,26 +131,41 @@ def _check_domain(domain: str) -> None:
         raise ValueError(f"uses operators of {domain[:40]!r}; only standard ones are allowed")
 
 
-def _check_node(data: memoryview, walk: _Walk) -> int:
-    operator, elements = "", 0
+def _check_node(data: memoryview, walk: _Walk) -> Node:
+    operator = ""
+    inputs: list[str] = []
+    outputs: list[str] = []
+    held: list[Constant] = []
+    numbers: list[float] = []
     for number, value in _message(walk, "node", data, _NODE_FIELDS):
-        if number == 4:
+        if number in (1, 2):
+            (inputs if number == 1 else outputs).append(_text(value))
+        elif number == 4:
             operator = _text(value)
         elif number == 7:
             _check_domain(_text(value))
         elif number == 5:
             for field, part in _message(walk, "attribute", _bytes(value), _ATTRIBUTE_FIELDS):
                 if field == 5:
-                    elements += _check_tensor(_bytes(part), walk, finite=False)
+                    held.append(_check_tensor(_bytes(part), walk, finite=False)[1])
+                elif field in (2, 3, 7, 8):
+                    numbers += _numbers({2: 4, 7: 4}.get(field, 7), part)
     if operator not in OPERATORS:
         raise ValueError(f"uses operator {operator[:40]!r}, which is not allowed")
-    return elements
+    if operator != "Constant":
+        return Node(operator, tuple(inputs), tuple(outputs), None)
+    if len(held) + bool(numbers) > 1:
+        raise ValueError(_DAMAGED)
+    if not held:
+        held = [Constant(len(numbers), (len(numbers),), tuple(numbers[:MOST_VALUES]))]
+    return Node(operator, (), tuple(outputs), held[-1])
 
 
-def _check_tensor(data: memoryview, walk: _Walk, *, finite: bool) -> int:
-    """Compare a tensor's shape with its data; return the number of its elements."""
+def _check_tensor(data: memoryview, walk: _Walk, *, finite: bool) -> tuple[str, Constant]:
+    """Compare a tensor's shape with its data; return its name and what it holds."""
     dims: list[int] = []
-    kind, raw, typed = 0, None, 0
+    name, kind, raw, typed = "", 0, None, 0
+    values: list[float] = []
     for number, value in _message(walk, "tensor", data, _TENSOR_FIELDS):
         if number == 13 or (number == 14 and value != 0):
             raise ValueError("keeps weights in another file (external data); export it as one file")
@@ -145,10 +173,14 @@ def _check_tensor(data: memoryview, walk: _Walk, *, finite: bool) -> int:
             dims += _whole(value)
         elif number == 2:
             kind = value if isinstance(value, int) else 0
+        elif number == 8:
+            name = _text(value)
         elif number == 9:
             raw = _bytes(value)
         elif number in (4, 5, 7, 10, 11):
             typed += _count_typed(number, value, finite=finite)
+            if typed <= MOST_VALUES:
+                values += _numbers(number, value)
     if kind not in _TYPES:
         raise ValueError(f"has a tensor of data type {kind}, which is not allowed")
     elements = math.prod(dims)
@@ -160,7 +192,12 @@ def _check_tensor(data: memoryview, walk: _Walk, *, finite: bool) -> int:
         raise ValueError("has a tensor whose data are not of its size; export it again")
     if finite and raw is not None and numeric and not _finite(raw, numeric):
         raise ValueError("has weights that are not finite")
-    return elements
+    if elements > MOST_VALUES:
+        return name, Constant(elements, tuple(dims))
+    if raw is not None and kind in _RAW_NUMBERS:
+        values = np.frombuffer(raw, _RAW_NUMBERS[kind]).tolist()
+    known = tuple(values) if len(values) == elements else None
+    return name, Constant(elements, tuple(dims), known)
 
 
 def _count_typed(number: int, value: int | memoryview, *, finite: bool) -> int:
@@ -173,6 +210,16 @@ def _count_typed(number: int, value: int | memoryview, *, finite: bool) -> int:
     if finite and not _finite(value, f"<f{width}"):
         raise ValueError("has weights that are not finite")
     return len(value) // width
+
+
+def _numbers(number: int, value: int | memoryview) -> list[float]:
+    """Read one of a tensor's typed fields: 4 float, 10 double, the others whole numbers."""
+    width = {4: 4, 10: 8}.get(number)
+    if width is None or isinstance(value, int):
+        return [whole - 2**64 if whole >= 2**63 else whole for whole in _whole(value)]
+    if len(value) % width:
+        raise ValueError(_DAMAGED)
+    return [float(one) for one in np.frombuffer(value, f"<f{width}")]
 
 
 def _finite(data: memoryview, numeric: str) -> bool:

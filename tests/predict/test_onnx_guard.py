@@ -9,14 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gcar_deploy.config import ModelLimits
 from gcar_deploy.predict.model_spec import shipped_model_path
+from gcar_deploy.predict.onnx_constants import Constant, Node, check_constants
 from gcar_deploy.predict.onnx_guard import OPERATORS, check_onnx
 
 onnx = pytest.importorskip("onnx", reason="needs the export extra")
 from google.protobuf.message import DecodeError  # noqa: E402
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+from onnx.reference import ReferenceEvaluator  # noqa: E402
 
 TINY = Path(__file__).parents[1] / "data" / "tiny.onnx"
 
@@ -132,6 +136,101 @@ def two_graphs(m: onnx.ModelProto) -> None:
     m.MergeFromString(m.SerializeToString())
 
 
+def constants(
+    *nodes: onnx.NodeProto, backwards: bool = False, **weights: np.ndarray
+) -> Callable[[onnx.ModelProto], None]:
+    """Add nodes and weights that end in ``c`` (in disorder with ``backwards``)."""
+
+    def change(m: onnx.ModelProto) -> None:
+        m.graph.initializer.extend(numpy_helper.from_array(v, k) for k, v in weights.items())
+        m.graph.node.extend(nodes[::-1] if backwards else nodes)
+
+    return change
+
+
+def sizes(*values: float) -> np.ndarray:
+    return np.array(values, np.int64)
+
+
+def node(operator: str, inputs: str, output: str = "c", **attributes: object) -> onnx.NodeProto:
+    return helper.make_node(operator, inputs.split(" ") if inputs else [], [output], **attributes)
+
+
+#: half a gigabyte and more out of a few bytes
+LARGE: dict[str, tuple[Callable[[onnx.ModelProto], None], str]] = {
+    "zeros": (constants(node("ConstantOfShape", "s"), s=sizes(2**27)), "ConstantOfShape for more"),
+    "zeros of a node's shape": (
+        constants(
+            node("Constant", "", "s", value_ints=[2**14, 2**14]), node("ConstantOfShape", "s")
+        ),
+        "ConstantOfShape for more",
+    ),
+    "zeros of a tensor's typed shape": (
+        lambda m: (
+            m.graph.initializer.append(helper.make_tensor("s", TensorProto.INT64, [1], [2**40])),
+            m.graph.node.append(node("ConstantOfShape", "s")),
+        ),
+        "ConstantOfShape for more",
+    ),
+    "a computed shape": (
+        constants(node("Mul", "s s", "t"), node("ConstantOfShape", "t"), s=sizes(2**14)),
+        "computed from constants",
+    ),
+    "a computed shape, written backwards": (
+        constants(
+            node("Mul", "s s", "t"), node("ConstantOfShape", "t"), s=sizes(2**14), backwards=True
+        ),
+        "computed from constants",
+    ),
+    "expanded": (constants(node("Expand", "w s"), s=sizes(2**26, 3, 2)), "Expand for more"),
+    "expanded input": (constants(node("Expand", "x s"), s=sizes(2**26, 3)), "Expand for more"),
+    "tiled": (constants(node("Tile", "w s"), s=sizes(2**13, 2**13)), "Tile for more"),
+    "tiled a little, thrice": (
+        constants(
+            node("Tile", "w s", "a"), node("Tile", "a s", "b"), node("Tile", "b s"),
+            s=sizes(2**6, 2**6),
+        ),
+        "constants of more than",
+    ),
+    "counted": (
+        constants(
+            node("Range", "a b d"),
+            a=np.array(0.0, np.float32), b=np.array(1.0, np.float32), d=np.array(1e-9, np.float32),
+        ),
+        "Range for more",
+    ),
+    "padded input": (constants(node("Pad", "x s"), s=sizes(0, 0, 2**20, 2**20)), "Pad for more"),
+    "resized input": (
+        constants(node("Resize", "x  s"), s=np.array([2**14, 2**14], np.float32)),
+        "Resize for more",
+    ),
+    "an outer product": (
+        constants(
+            node("Add", "a b"), a=np.zeros((2**13, 1), np.float32),
+            b=np.zeros((1, 2**13), np.float32),
+        ),
+        "constants of more than",
+    ),
+    "a product of matrices": (
+        constants(
+            node("MatMul", "a b"), a=np.zeros((2**13, 1), np.float32),
+            b=np.zeros((1, 2**13), np.float32),
+        ),
+        "constants of more than",
+    ),
+    "many zeros of allowed size": (
+        constants(
+            *(node("ConstantOfShape", "s", f"c{k}") for k in range(9)), s=sizes(2**11, 2**11)
+        ),
+        "constants of more than",
+    ),
+    "padded by a convolution": (
+        constants(node("Conv", "k k", pads=[2**14] * 4), k=np.ones((1, 1, 3, 3), np.float32)),
+        "Conv of constants",
+    ),
+    "one name twice": (constants(w=np.ones(1, np.float32)), "two weights"),
+}  # fmt: skip
+
 ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], None], str]] = {
     "external data": (external, "another file"),
     "external data by name": (external_named_only, "another file"),
@@ -157,6 +256,7 @@ ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], None], str]] = {
     "infinite weights": (filled(np.inf, typed=True), "not finite"),
     "text weights": (text, "text"),
     "unknown opset": (old, "opset"),
+    **LARGE,
 }
 
 
@@ -180,6 +280,56 @@ def test_attack_is_refused(name):
     change(attacked)
     with pytest.raises(ValueError, match=words):
         check_onnx(attacked.SerializeToString(), ModelLimits())
+
+
+@pytest.mark.req("REQ-17")
+def test_constants_of_a_network_pass():
+    """What exporters leave: small zeros, shapes of shapes, a table added to a table, upsampling."""
+    change = constants(
+        node("ConstantOfShape", "s", "zeros"),
+        node("Add", "zeros table", "sum"),
+        node("MatMul", "x sum", "h2"),
+        node("Expand", "h2 t", "h3"),
+        node("Shape", "x", "shape"),
+        node("ConstantOfShape", "shape", "more"),
+        node("Constant", "", "k", value_float=2.0),
+        node("Mul", "h3 k"),
+        s=sizes(3, 512), t=sizes(4, 1, 512), table=np.ones((3, 512), np.float32),
+    )  # fmt: skip
+    m = model()
+    change(m)
+    check_onnx(m.SerializeToString(), ModelLimits())
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_no_constant_is_larger_than_reckoned(data):
+    """Random chains of constants, computed by the reference implementation."""
+    weights = {"a": np.ones((2, 3), np.float32), "b": np.ones(3, np.float32), "s": sizes(2, 3)}
+    names, steps = ["a", "b"], []
+    for k in range(data.draw(st.integers(1, 5))):
+        operator = data.draw(st.sampled_from(["Add", "MatMul", "Concat", "Expand", "Tile", "Neg"]))
+        inputs = [data.draw(st.sampled_from(names)) for _ in range(2)]
+        if operator in ("Neg", "Expand", "Tile"):
+            inputs[1:] = [] if operator == "Neg" else ["s"]
+        extra = {"axis": 0} if operator == "Concat" else {}
+        names.append(f"n{k}")
+        steps.append(node(operator, " ".join(inputs), names[-1], **extra))
+    end = helper.make_tensor_value_info(names[-1], TensorProto.FLOAT, None)
+    held = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    whole = helper.make_model(
+        helper.make_graph(steps, "g", [], [end], held),
+        opset_imports=[helper.make_opsetid("", 18)],
+    )
+    try:
+        (found,) = ReferenceEvaluator(whole).run(None, {})
+    except Exception:  # noqa: BLE001 - shapes that do not fit together
+        return
+    check_onnx(whole.SerializeToString(), ModelLimits())
+    known = {name: Constant(v.size, v.shape, tuple(v.ravel())) for name, v in weights.items()}
+    nodes = [Node(n.op_type, tuple(n.input), tuple(n.output)) for n in steps]
+    with pytest.raises(ValueError, match="more than"):
+        check_constants(known, nodes, found.size - 1)
 
 
 @pytest.mark.parametrize("data", [b"", b"x", b"not a graph", bytes(64), b"\xff" * 64, b"\x3a\x00"])
