@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions
+from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions, check_options
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
@@ -59,6 +59,8 @@ class Engine:
 
     Raises
     ------
+    UsageError
+        An option is out of its range (``config/ranges.py``).
     ModelError
         The model given is missing, or a model is altered or unfit. Where no model is given and
         none is installed, the visual hull is thinned instead, and every result says so.
@@ -73,6 +75,7 @@ class Engine:
         session: Any = None,
     ) -> None:
         self.options = options or RunOptions()
+        check_options(self.options)
         if threads is not None and threads < 1:
             raise UsageError(f"threads = {threads} must be 1 or more")
         self.threads = threads or min(os.cpu_count() or 1, 4)

@@ -41,12 +41,14 @@ def read_bounded(path: str | Path, max_bytes: int) -> bytes:
         os.close(handle)
         raise
     with stream:
-        data = stream.read(max_bytes + 1) if info.st_size <= max_bytes else b""
-    if info.st_size > max_bytes or len(data) > max_bytes:
+        # No more than the file holds is asked for: a limit is no reason to allocate.
+        data = stream.read(info.st_size + 1) if info.st_size <= max_bytes else b""
+    if info.st_size > max_bytes:
         raise ValueError(
-            f"is larger than the {_size(max_bytes)} that are read "
-            f"({_size(max(info.st_size, len(data)))})"
+            f"is larger than the {_size(max_bytes)} that are read ({_size(info.st_size)})"
         )
+    if len(data) > info.st_size:
+        raise ValueError("grew while it was read; try again when it is complete")
     if not data:
         raise ValueError("is empty; copy or export it again")
     return data

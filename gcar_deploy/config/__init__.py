@@ -21,6 +21,7 @@ from gcar_deploy.config.predict import (
     SingleViewOptions,
 )
 from gcar_deploy.config.quality import QualityOptions
+from gcar_deploy.config.ranges import check_options
 from gcar_deploy.config.refine import (
     PaperOptions,
     RefineOptions,
@@ -50,10 +51,11 @@ __all__ = [
     "TreeOptions",
     "TubeOptions",
     "VolumeOptions",
+    "check_options",
 ]
 
 #: (col, row) of one point in each view, None where it is not seen
-Landmark: TypeAlias = "tuple[tuple[float, float] | None, ...]"
+Landmark: TypeAlias = tuple[tuple[float, float] | None, ...]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
+
+from gcar_deploy.config.ranges import Range, Scale, Share, Size
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelLimits:
     """What a model file may be before ONNX Runtime sees it."""
 
-    max_bytes: int = 64 * 2**20
+    max_bytes: Size = 64 * 2**20
     #: of the spec beside it, and of the golden input and output
-    max_spec_bytes: int = 64 * 2**10
-    max_golden_bytes: int = 8 * 2**20
-    max_nodes: int = 20_000
+    max_spec_bytes: Size = 64 * 2**10
+    max_golden_bytes: Size = 8 * 2**20
+    max_nodes: Size = 20_000
     #: fields of the file in all (a node has some ten)
-    max_fields: int = 1_000_000
+    max_fields: Size = 1_000_000
     #: weights and constants in all
-    max_elements: int = 2**25
-    max_opset: int = 30
+    max_elements: Size = 2**25
+    max_opset: Size = 30
     #: largest relative and absolute difference from the golden output
-    golden_rtol: float = 1e-3
-    golden_atol: float = 1e-4
+    golden_rtol: Annotated[float, Range(0, 1000)] = 1e-3
+    golden_atol: Annotated[float, Range(0, 1000)] = 1e-4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,26 +33,26 @@ class CandidateOptions:
 
     #: a lattice point is kept where each view's path exceeds this share of a cell's edge; lower
     #: keeps more of the rim of thin vessels, higher gives the predictor fewer points to judge
-    min_path_cells: float = 0.5
+    min_path_cells: Annotated[float, Range(0, 100)] = 0.5
     #: passes of the thinning that stands in for a model
-    thinning_steps: int = 40
+    thinning_steps: Annotated[int, Range(0, 10000)] = 40
     #: power applied after each pass; above 1 weak shares give way to strong ones
-    thinning_sharpness: float = 1.05
+    thinning_sharpness: Annotated[float, Range(0.1, 100)] = 1.05
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DecideOptions:
     """From confidences to a decision (see ``predict/decide.py``)."""
 
-    steps: int = 24
+    steps: Annotated[int, Range(1, 10000)] = 24
     #: inverse temperature reached at the last step
-    final_sharpness: float = 3.0
+    final_sharpness: Annotated[float, Range(1e-3, 1000)] = 3.0
     #: weight of a vessel neighbour, and how many of the 26 are support enough
-    coupling: float = 1.0
-    enough_neighbours: float = 3.0
+    coupling: Annotated[float, Range(0, 1000)] = 1.0
+    enough_neighbours: Annotated[float, Range(1e-3, 1000)] = 3.0
     #: how freely a ray may differ from its path length, cells squared per unit of evidence
-    looseness: float = 0.5
-    looseness_uncalibrated: float = 4.0
+    looseness: Scale = 0.5
+    looseness_uncalibrated: Scale = 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,7 +61,7 @@ class SingleViewOptions:
 
     #: a depth off by so many pixel edges of the network's picture counts a quarter; the shipped
     #: model is off by some 9 (median, generated scenes)
-    depth_scale_pixels: float = 8.0
+    depth_scale_pixels: Scale = 8.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,10 +72,10 @@ class PredictOptions:
     predictor: str = "auto"
     #: lattices on which the multi-view predictor judges the scene, each shifted against the others;
     #: after the first only what lies near points of at least this confidence is asked again
-    looks: int = 2
-    look_again: float = 0.15
+    looks: Annotated[int, Range(1, 4)] = 2
+    look_again: Share = 0.15
     #: edge of the lattice the predictor works on: the grid's own within these bounds, mm
-    min_cell_mm: float = 0.85
-    max_cell_mm: float = 1.5
+    min_cell_mm: Annotated[float, Range(0.3, 10)] = 0.85
+    max_cell_mm: Annotated[float, Range(0.3, 10)] = 1.5
     limits: ModelLimits = dataclasses.field(default_factory=ModelLimits)
     single: SingleViewOptions = dataclasses.field(default_factory=SingleViewOptions)

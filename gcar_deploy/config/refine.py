@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
+
+from gcar_deploy.config.ranges import Count, Length, Range, Scale, Share
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -10,23 +13,23 @@ class TreeOptions:
     """From points to a centreline graph."""
 
     #: smoothing of the points' confidence before thresholding, lattice cells (sigma)
-    smooth_cells: float = 0.6
+    smooth_cells: Annotated[float, Range(0, 20)] = 0.6
     #: hysteresis on the smoothed confidence: kept from ``low`` where connected to ``high``
-    low: float = 0.08
-    high: float = 0.25
+    low: Annotated[float, Range(1e-3, 1)] = 0.08
+    high: Annotated[float, Range(1e-3, 1)] = 0.25
     #: a side branch must stick out of its parent by this many lattice cells
-    min_branch_cells: float = 4.0
+    min_branch_cells: Length = 4.0
     #: a component shorter than this is dropped, lattice cells
-    min_component_cells: float = 8.0
+    min_component_cells: Length = 8.0
     #: gaps up to this long between a free end and another piece are bridged, lattice cells
-    max_gap_cells: float = 5.0
+    max_gap_cells: Annotated[float, Range(0, 100)] = 5.0
     #: distance between centreline points, lattice cells
-    step_cells: float = 0.8
+    step_cells: Annotated[float, Range(0.05, 20)] = 0.8
     #: correlation length of the centreline's smoothing, lattice cells
-    curve_cells: float = 2.0
+    curve_cells: Annotated[float, Range(0.01, 100)] = 2.0
     #: radii outside are not believed, mm
-    min_radius_mm: float = 0.25
-    max_radius_mm: float = 4.0
+    min_radius_mm: Annotated[float, Range(0.01, 100)] = 0.25
+    max_radius_mm: Annotated[float, Range(0.01, 100)] = 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,60 +37,65 @@ class TubeOptions:
     """The default refiner: tubes fitted to the pictures by Gauss-Newton."""
 
     #: working pixel at the isocentre per level, coarse to fine; 0 is the picture's own, mm
-    levels_mm: tuple[float, ...] = (1.0, 0.0)
+    levels_mm: Annotated[tuple[float, ...], Range(0, 100, many=1)] = (1.0, 0.0)
     #: most Gauss-Newton steps per level
-    steps: tuple[int, ...] = (6, 5)
+    steps: Annotated[tuple[int, ...], Range(0, 10_000, many=1)] = (6, 5)
     #: noise of the path length: constant part, and share of the path, per mm^2 of picture
-    noise_mm: float = 0.4
-    noise_share: float = 0.05
+    noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.4
+    noise_share: Annotated[float, Range(0, 100)] = 0.05
     #: the share where the picture is not calibrated
-    noise_share_uncalibrated: float = 0.25
+    noise_share_uncalibrated: Annotated[float, Range(0, 100)] = 0.25
     #: residuals beyond this many sigma lose weight (Cauchy)
-    robust_sigmas: float = 2.0
+    robust_sigmas: Annotated[float, Range(1e-3, 1e6)] = 2.0
     #: centreline: random walk of the direction, 1 / sqrt(mm)
-    bend: float = 0.15
+    bend: Annotated[float, Range(1e-6, 1e9)] = 0.15
     #: radius: random walk of its log, 1 / sqrt(mm)
-    taper: float = 0.1
+    taper: Annotated[float, Range(1e-6, 1e9)] = 0.1
     #: pixels below this at the isocentre show narrow cores, and loosen the taper in proportion, mm
-    taper_pixel_mm: float = 0.85
+    taper_pixel_mm: Scale = 0.85
     #: ... but at most so many times
-    most_taper_easing: float = 3.0
+    most_taper_easing: Annotated[float, Range(1, 1e6)] = 3.0
     #: radii refitted with the axes held, on such fine pixels: steps, noise of the path length, mm
-    calibre_steps: int = 3
-    calibre_noise_mm: float = 0.15
+    calibre_steps: Annotated[int, Range(0, 10000)] = 3
+    calibre_noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.15
     #: ... and the walk of their log: scale, 1 / sqrt(mm), and Student's degrees of freedom
-    calibre_walk: float = 0.2
-    calibre_freedom: float = 3.0
+    calibre_walk: Annotated[float, Range(1e-6, 1e9)] = 0.2
+    calibre_freedom: Annotated[float, Range(1e-3, 1e6)] = 3.0
     #: starting points: standard deviation over 1 mm of centreline, mm
-    anchor_mm: float = 1.0
+    anchor_mm: Annotated[float, Range(1e-3, 1e6)] = 1.0
     #: starting radii: standard deviation of the log over 1 mm of centreline
-    anchor_log_radius: float = 0.5
+    anchor_log_radius: Annotated[float, Range(1e-3, 1e6)] = 0.5
     #: blur of vessel edges that is not the pixel's own (motion, focal spot), box width, mm
-    edge_blur_mm: float = 0.5
+    edge_blur_mm: Annotated[float, Range(0, 100)] = 0.5
     #: share of the pictures' weight that goes to their centreline alone (the paper's 1 - alpha)
-    centreline_share: float = 0.0
+    centreline_share: Share = 0.0
     #: a level ends when a step lowers the objective by less than this share
-    tolerance: float = 3e-3
+    tolerance: Annotated[float, Range(0, 1)] = 3e-3
     #: a branch or a free end is dropped where less than this share of it is seen in some view
-    min_seen: float = 0.4
+    min_seen: Share = 0.4
     #: branches are judged in pieces of at most this length, mm
-    piece_mm: float = 100.0
+    piece_mm: Annotated[float, Range(0.5, 1e6)] = 100.0
     #: cost of a mm of piece per confidence below ``fair_confidence``, units of the objective
-    piece_cost: float = 20.0
-    fair_confidence: float = 0.4
+    piece_cost: Annotated[float, Range(0, 1e6)] = 20.0
+    fair_confidence: Share = 0.4
     #: a piece is never dropped whose confidence is at least this share of the kept ones' median
-    trusted_share: float = 0.8
+    trusted_share: Annotated[float, Range(0, 1000)] = 0.8
     #: a piece standing alone is at most so many times as thick as the starting points say
-    piece_growth: float = 2.5
+    piece_growth: Annotated[float, Range(1e-3, 1e6)] = 2.5
     #: a piece is kept from this share on; 0 keeps all
-    min_share: float = 0.5
+    min_share: Share = 0.5
     #: a dropped piece comes back where every view misses at least this share of it
-    missed_share: float = 0.45
+    missed_share: Share = 0.45
     #: free ends grow along what no tube explains, at most this far, mm
-    max_growth_mm: float = 25.0
+    max_growth_mm: Annotated[float, Range(0, 1000)] = 25.0
     #: prior on the geometry that the stated sigma includes: angles, and table position
-    geometry_deg: float = 0.5
-    geometry_mm: float = 0.5
+    geometry_deg: Annotated[float, Range(0, 90)] = 0.5
+    geometry_mm: Annotated[float, Range(0, 1000)] = 0.5
+
+    def contradiction(self) -> str:
+        """Say which fields do not fit together; empty where all do."""
+        fits = len(self.levels_mm) == len(self.steps)
+        return "" if fits else "steps must be as many as levels_mm"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,21 +105,21 @@ class VolumeOptions:
     #: correct the tubes' occupancy by pictures and starting points; else round tubes only
     fuse: bool = True
     #: standard deviation of a voxel half inside a tube, and of one far from its surface
-    surface_sigma: float = 0.3
-    floor_sigma: float = 0.03
+    surface_sigma: Annotated[float, Range(1e-3, 100)] = 0.3
+    floor_sigma: Annotated[float, Range(1e-3, 100)] = 0.03
     #: how far such differences reach along a vessel and across it, voxels (sigma)
-    along_voxels: float = 1.0
-    across_voxels: float = 0.6
+    along_voxels: Annotated[float, Range(0, 100)] = 1.0
+    across_voxels: Annotated[float, Range(0, 100)] = 0.6
     #: noise of the path length per pixel of about a voxel: constant part, share of the path
-    noise_mm: float = 0.3
-    noise_share: float = 0.1
+    noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.3
+    noise_share: Annotated[float, Range(0, 100)] = 0.1
     #: least noise of a lattice point's confidence; of scattered points: variance per occupancy
-    confidence_sigma: float = 0.08
-    scatter_variance: float = 0.25
+    confidence_sigma: Annotated[float, Range(1e-3, 100)] = 0.08
+    scatter_variance: Annotated[float, Range(1e-3, 100)] = 0.25
     #: points scattered more than this say nothing about single voxels, voxels (sigma)
-    max_scatter_voxels: float = 0.8
+    max_scatter_voxels: Annotated[float, Range(0, 1000)] = 0.8
     #: more voxels than this near a surface are left to the round tubes
-    max_cells: int = 60_000
+    max_cells: Count = 60_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -119,35 +127,35 @@ class PaperOptions:
     """The paper's refinement: Gaussians, Adam, adaptive density control."""
 
     #: weight of the plain projection loss; the centreline loss has the rest (the paper's 0.5)
-    alpha: float = 0.5
-    steps: int = 150
+    alpha: Share = 0.5
+    steps: Count = 150
     #: pictures are sampled to this pixel at the isocentre (the paper's 128^2), mm
-    pixel_mm: float = 1.0
+    pixel_mm: Annotated[float, Range(0.05, 50)] = 1.0
     #: learning rates: mm, log scale through its sigmoid, quaternion, softplus intensity
-    rate_mean_mm: float = 0.05
-    rate_scale: float = 0.05
-    rate_rotation: float = 0.02
-    rate_intensity: float = 0.05
+    rate_mean_mm: Annotated[float, Range(0, 10)] = 0.05
+    rate_scale: Annotated[float, Range(0, 10)] = 0.05
+    rate_rotation: Annotated[float, Range(0, 10)] = 0.02
+    rate_intensity: Annotated[float, Range(0, 10)] = 0.05
     #: rates fall to this share of themselves over the steps
-    final_rate: float = 0.2
+    final_rate: Annotated[float, Range(1e-6, 1)] = 0.2
     #: start: points at least so confident, sigma in cells, and the cap that always holds
-    least_confidence: float = 0.3
-    initial_sigma_cells: float = 0.55
-    most_gaussians: int = 10_000
+    least_confidence: Share = 0.3
+    initial_sigma_cells: Annotated[float, Range(1e-3, 3)] = 0.55
+    most_gaussians: Annotated[int, Range(1, 1000000)] = 10_000
     #: points nearer than this to a more confident one share its Gaussian, cells; 0 keeps all.
     #: 1.1 halves Gaussians and time, and costs accuracy where the points are good
-    thin_cells: float = 0.0
+    thin_cells: Annotated[float, Range(0, 100)] = 0.0
     #: bounds of the standard deviations
-    least_sigma_pixels: float = 0.25
-    largest_sigma_mm: float = 10.0
+    least_sigma_pixels: Annotated[float, Range(1e-3, 100)] = 0.25
+    largest_sigma_mm: Annotated[float, Range(0.01, 1000)] = 10.0
     #: density control: steps between, pull against the mean pull, size that splits, mass that goes
-    control_every: int = 40
-    pull_ratio: float = 4.0
-    split_pixels: float = 1.5
-    least_mass_share: float = 0.02
+    control_every: Count = 40
+    pull_ratio: Annotated[float, Range(0, 1e6)] = 4.0
+    split_pixels: Annotated[float, Range(0, 1e6)] = 1.5
+    least_mass_share: Share = 0.02
     #: stop when the best of so many steps is not better by this share
-    patience: int = 20
-    tolerance: float = 2e-3
+    patience: Count = 20
+    tolerance: Share = 2e-3
     #: what projects: ``numpy``, or ``torch`` (the reference twin) on ``cpu`` or ``cuda``
     backend: str = "numpy"
     device: str = "cpu"

@@ -148,7 +148,7 @@ def _constant_size(node: Node, known: Mapping[str, Constant], most: int) -> Cons
     places = _SIZES.get(node.operator, ())
     names = [node.inputs[k] if k < len(node.inputs) else "" for k in places]
     if node.operator == "Resize":  # scales or sizes: the other is left out or empty
-        names = [name for name in names if name and getattr(known.get(name), "elements", 1)]
+        names = [name for name in names if name and (name not in known or known[name].elements)]
     told = [known.get(name) for name in names]
     if not told or any(one is None for one in told):
         return None
