@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.config import RunOptions
+from gcar_deploy.agreement import agreeing, check_consistency, order_of, with_hint
+from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.engine import load_segmenter, prepare
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
@@ -19,8 +20,7 @@ from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.quality import check_consistency, check_views
-from gcar_deploy.reconstruct import agreeing
+from gcar_deploy.quality import check_views
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -65,6 +65,7 @@ def inspect_files(
     options = options or RunOptions()
     found = Inspection()
     try:
+        check_options(options)
         angiograms, grid, warnings = prepare(pictures, geom, options)
         found.warnings += warnings
         carms = [a.carm for a in angiograms]
@@ -127,7 +128,9 @@ def _consistency(
                 pair["shift_mm"] = float(np.linalg.norm(pose.offset_mm))
                 pair["after_shift"] = pose.after
     after, partners = [p.after for p in poses], [p.partner for p in poses]
-    return apart + check_consistency(views, after, options.quality, partners)
+    order, hint = order_of(views, poses, options)
+    with with_hint(hint):
+        return apart + order + check_consistency(views, after, options.quality, partners)
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:

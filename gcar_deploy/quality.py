@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gcar_deploy.agreement import disagreement_limits
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.errors import GeometryError, RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
@@ -117,43 +118,6 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
     return []
 
 
-def check_consistency(
-    views: Sequence[VesselImage],
-    disagreement: Sequence[float],
-    options: QualityOptions,
-    partners: Sequence[int] | None = None,
-) -> list[str]:
-    """Judge whether the views can show one tree.
-
-    Parameters
-    ----------
-    views : V vessel images
-    disagreement : (V,) of each view's epipolar profile with its partner's, 0 .. 1
-    partners : (V,) which view each was compared with; the first where left out
-
-    Raises
-    ------
-    RefusedError
-        The views contradict each other.
-    """
-    findings = []
-    for k, (view, value) in enumerate(zip(views, disagreement, strict=True)):
-        other = views[partners[k] if partners else 0]
-        good, most = _disagreement_limits([other, view], options)
-        if value > most:
-            raise RefusedError(
-                f"views {other.view_id} and {view.view_id} contradict each other: the vessels "
-                f"differ by {value:.0%} along the epipolar lines (at most {most:.0%}); "
-                "different patients, frames or angles?"
-            )
-        if value > good:
-            findings.append(
-                f"view {view.view_id} agrees poorly with view {other.view_id}: {value:.0%} of "
-                "the vessel differs along the epipolar lines"
-            )
-    return findings
-
-
 def check_poses(
     views: Sequence[VesselImage],
     corrections: Sequence[tuple[float, float]],
@@ -194,14 +158,6 @@ def check_candidates(count: int, lattice: Grid, options: QualityOptions) -> None
         )
 
 
-def _disagreement_limits(
-    views: Sequence[VesselImage], options: QualityOptions
-) -> tuple[float, float]:
-    if all(view.calibrated for view in views):
-        return options.good_disagreement, options.max_disagreement
-    return options.good_disagreement_raw, options.max_disagreement_raw
-
-
 def check_tree(tree: Tree, options: QualityOptions) -> None:
     """Refuse what is too little to be a coronary tree.
 
@@ -240,29 +196,12 @@ def assess(
     RefusedError
         Hardly anything of a view is explained, or hardly anything of the tree is seen.
     """
-    findings = list(findings)
-    judged = []
-    doubtful = (disagreement or 0.0) > _disagreement_limits(views, options)[0]
-    for view, inside in zip(views, lumen, strict=True):
-        one = view_quality(tree, view, inside, options, _across(view, views))
-        judged.append(one)
-        if doubtful and (one.coverage or 0.0) < options.good_coverage:
-            raise RefusedError(
-                f"the views contradict each other: {disagreement:.0%} of the vessels differ along "
-                f"the epipolar lines, and no tree explains more than {one.coverage or 0.0:.0%} of "
-                f"view {view.view_id}; different patients, frames or angles?"
-            )
-        for value, least, good, what in (
-            (one.coverage, options.min_coverage, options.good_coverage,
-             "of the picture's vessels are explained by the tree"),
-            (one.support, options.min_support, options.good_support,
-             "of the tree lies on the picture's vessels"),
-        ):  # fmt: skip
-            share = 0.0 if value is None else value
-            if share < least:
-                raise RefusedError(f"view {view.view_id}: only {share:.0%} {what}")
-            if share < good:
-                findings.append(f"view {view.view_id}: only {share:.0%} {what}")
+    judged = [
+        view_quality(tree, view, inside, options, _across(view, views))
+        for view, inside in zip(views, lumen, strict=True)
+    ]
+    calibrated = all(view.calibrated for view in views)
+    findings = [*findings, *check_explained(judged, disagreement, calibrated, options)]
     return Quality(
         status=DEGRADED if findings else OK,
         sentence=_sentence(findings, len(views)),
@@ -273,11 +212,54 @@ def assess(
     )
 
 
+def check_explained(
+    views: Sequence[ViewQuality],
+    disagreement: float | None,
+    calibrated: bool,
+    options: QualityOptions,
+) -> list[str]:
+    """Judge how much of the pictures a tree explains, and how much of it they show.
+
+    Parameters
+    ----------
+    views : what the comparison of each picture with the tree gave
+    disagreement : worst epipolar disagreement, None if it was not measured
+    calibrated : whether all pictures are
+
+    Raises
+    ------
+    RefusedError
+        As for ``assess``.
+    """
+    findings = []
+    doubtful = (disagreement or 0.0) > disagreement_limits(calibrated, options)[0]
+    for one in views:
+        if doubtful and (one.coverage or 0.0) < options.good_coverage:
+            raise RefusedError(
+                f"the views contradict each other: {disagreement:.0%} of the vessels differ along "
+                f"the epipolar lines, and no tree explains more than {one.coverage or 0.0:.0%} of "
+                f"view {one.view_id}; different patients, frames or angles?"
+            )
+        for value, least, good, what in (
+            (one.coverage, options.min_coverage, options.good_coverage,
+             "of the picture's vessels are explained by the tree"),
+            (one.support, options.min_support, options.good_support,
+             "of the tree lies on the picture's vessels"),
+        ):  # fmt: skip
+            share = 0.0 if value is None else value
+            if share < least:
+                raise RefusedError(f"view {one.view_id}: only {share:.0%} {what}")
+            if share < good:
+                findings.append(f"view {one.view_id}: only {share:.0%} {what}")
+    return findings
+
+
 def _sentence(findings: Sequence[str], count: int) -> str:
     if not findings:
         return f"All {count} views are explained by one tree."
     more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
-    return findings[0][0].upper() + findings[0][1:] + more + "."
+    text = findings[0][0].upper() + findings[0][1:] + more
+    return text if text.endswith("?") else f"{text}."
 
 
 def _across(view: VesselImage, views: Sequence[VesselImage]) -> VesselImage | None:

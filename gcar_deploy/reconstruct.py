@@ -13,8 +13,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy import alternatives, quality
+from gcar_deploy.agreement import (
+    agreeing,
+    check_consistency,
+    order_of,
+    poses_between,
+    with_hint,
+)
 from gcar_deploy.bundling import bundled, posed
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
@@ -22,7 +29,6 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.net import Segmenter
-from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
 from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
@@ -33,7 +39,7 @@ from gcar_deploy.predict.looks import mean_evidence, near_evidence, shifted_latt
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.refine.landmarks import landmark_pixels
-from gcar_deploy.refine.pose import Pose, estimate_poses, judged_poses
+from gcar_deploy.refine.pose import Pose
 from gcar_deploy.refine.refine import Refined, refine, refined_volume
 from gcar_deploy.refine.tube_model import footprint, tubes_of
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
@@ -87,6 +93,7 @@ def reconstruct(
     """
     if len(angiograms) < 2:
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
+    check_options(options)
     landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
     watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
                       used_s=used_s)  # fmt: skip
@@ -97,16 +104,20 @@ def reconstruct(
         views, poses, apart = agreeing(angiograms, views, options)
         findings += apart
         poses = _bundled(views, poses, grid, predictor, options, watch)
+        order, hint = order_of(views, poses, options)
+        findings += order
         findings += quality.check_poses(
             views, [(p.shift_mm, p.turn_deg) for p in poses], options.quality
         )
-        findings += quality.check_consistency(
-            views, [p.after for p in poses], options.quality, [p.partner for p in poses]
-        )
+        with with_hint(hint):
+            findings += check_consistency(
+                views, [p.after for p in poses], options.quality, [p.partner for p in poses]
+            )
         views = [posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
         hull, known = _hull(views, grid, options)
-        quality.check_candidates(len(hull), hull.lattice, options.quality)
+        with with_hint(hint):
+            quality.check_candidates(len(hull), hull.lattice, options.quality)
         watch.check()
         encoded = encode(hull, known)
     with watch.stage("centers"):
@@ -142,7 +153,8 @@ def reconstruct(
             tree, told, encoded.ray, encoded.weight
         )  # fmt: skip
         findings += alternatives.findings(open_, elsewhere)
-        judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
+        with with_hint(hint):
+            judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=tuple(views), poses=poses,
@@ -222,69 +234,6 @@ def _vessels(
         views.append(extract_vessels(angiogram, options.imaging, segmenter))
         report(len(views) / len(angiograms))
     return views
-
-
-def agreeing(
-    angiograms: Sequence[Angiogram], views: Sequence[VesselImage], options: RunOptions
-) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
-    """Estimate poses; where raw pictures disagree, from the largest part of each if those agree.
-
-    What was taken for vessel in one picture's background stands apart from the tree as a rule and
-    has no counterpart in the other picture. Parts of a mask that the user gave are never dropped.
-
-    Returns
-    -------
-    views : as given, or their largest connected parts
-    poses : one per view
-    findings : that parts were left out, which makes the result ``degraded``
-    """
-    poses = poses_between(views, options)
-    limits = options.quality
-    worst = max(p.after for p in poses)
-    if all(v.calibrated for v in views) or worst <= limits.parts_disagreement_raw:
-        return list(views), poses, []
-    main = [
-        view if view.calibrated or angiogram.mask is not None else largest_part(view)
-        for angiogram, view in zip(angiograms, views, strict=True)
-    ]
-    if all(a is b for a, b in zip(main, views, strict=True)):
-        return list(views), poses, []
-    closer = poses_between(main, options)
-    if max(p.after for p in closer) > limits.good_disagreement_raw:
-        return list(views), poses, []
-    findings = [
-        f"view {one.view_id}: {1 - one.mask.sum() / view.mask.sum():.0%} of what looks like vessel "
-        "stands apart and has no counterpart in the other views: left out as background"
-        for one, view in zip(main, views, strict=True)
-        if one is not view
-    ]
-    return main, closer, findings
-
-
-def poses_between(
-    views: Sequence[VesselImage], options: RunOptions, known: Sequence[Pose] | None = None
-) -> tuple[Pose, ...]:
-    """Estimate the correction of every view against the first from their vessel profiles.
-
-    With ``known`` corrections nothing is estimated, only what the profiles say of them.
-    """
-    # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
-    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
-    calibrated = [view.calibrated for view in views]
-    finest = max(pixel, options.predict.min_cell_mm) if all(calibrated) else 0.75 * pixel
-    pose = dataclasses.replace(
-        options.pose,
-        fine_mm=max(options.pose.fine_mm, finest),
-        coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
-    )
-    small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
-    marks = landmark_pixels(options.landmarks, [view.carm for view in views])
-    for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
-        scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
-        marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
-    if known is not None:
-        return judged_poses(known, small, pose, marks, calibrated)
-    return estimate_poses(small, pose, marks, calibrated)
 
 
 def _bundled(

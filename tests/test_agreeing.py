@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gcar_deploy.agreement import agreeing, order_of, other_order, poses_between
 from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.parts import largest_part
+from gcar_deploy.imaging.resample import resized
 from gcar_deploy.imaging.skeleton import skeletonize
-from gcar_deploy.reconstruct import agreeing, poses_between
 
 render = pytest.importorskip("gcar_export.render", reason="needs the export extra")
 from gcar_export.trees import random_tree  # noqa: E402
@@ -90,3 +91,28 @@ def test_a_mask_given_by_the_user_and_path_lengths_are_never_cut():
     assert agreeing(told, views, OPTIONS)[0][0] is views[0]
     angiograms, views = pair(stranger=True, calibrated=True)
     assert agreeing(angiograms, views, OPTIONS)[0][0] is views[0]
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_swapped_pictures_agree_better_the_other_way_round(calibrated):
+    _, (one, two) = pair(calibrated=calibrated)
+    given = [
+        dataclasses.replace(one, carm=two.carm, view_id="2"),
+        dataclasses.replace(two, carm=one.carm),
+    ][::-1]
+    findings, hint = order_of(given, poses_between(given, OPTIONS), OPTIONS)
+    assert hint and findings == [hint] and "swapped?" in hint
+    assert order_of([one, two], poses_between([one, two], OPTIONS), OPTIONS) == ([], "")
+
+
+def test_pictures_of_two_sizes_or_three_views_have_no_other_order():
+    _, (one, two) = pair()
+    assert other_order([one, two], OPTIONS) is not None
+    assert other_order([one, resized(two, 96, 96)], OPTIONS) is None
+    assert other_order([one, two, two], OPTIONS) is None
+
+
+def test_the_order_of_two_trees_cannot_be_told():
+    """No tree explains them either way: nothing is said of swapping in particular."""
+    _, views = pair(seeds=(4, 9))
+    assert order_of(views, poses_between(views, OPTIONS), OPTIONS)[1] == ""

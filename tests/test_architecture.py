@@ -13,18 +13,20 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "gcar_deploy"
 #: lower numbers never import higher ones; rooms on one floor keep apart unless listed below
 FLOORS = {
-    "errors": 0, "types": 0, "config": 0, "files": 0, "stopwatch": 1,
-    "geometry": 1,
-    "imaging": 2, "gaussians": 2,
-    "tree": 3, "dicom": 3,
-    "predict": 4, "refine": 4,
-    "quality": 5, "metrics": 5, "alternatives": 5, "bundling": 5,
-    "output": 6,
-    "selftest": 6, "data": 6,
-    "reconstruct": 7,
-    "engine": 8,
-    "inspection": 9, "worker": 9, "batch": 9, "benchmark": 9, "stages": 9,
-    "cli": 10,
+    "errors": 0, "types": 0, "files": 0,
+    "config": 1, "stopwatch": 1,
+    "geometry": 2,
+    "imaging": 3, "gaussians": 3,
+    "tree": 4, "dicom": 4,
+    "predict": 5, "refine": 5,
+    "agreement": 6,
+    "quality": 7, "metrics": 7, "alternatives": 7, "bundling": 7,
+    "output": 8,
+    "selftest": 8, "data": 8,
+    "reconstruct": 9,
+    "engine": 10,
+    "inspection": 11, "worker": 11, "batch": 11, "benchmark": 11, "stages": 11,
+    "cli": 12,
 }  # fmt: skip
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load
 HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", "pydicom")

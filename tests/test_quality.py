@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gcar_deploy.agreement import check_consistency, check_order, with_hint
 from gcar_deploy.config import ImagingOptions, QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.grid import Grid
@@ -15,7 +16,6 @@ from gcar_deploy.quality import (
     assess,
     best_separation,
     check_candidates,
-    check_consistency,
     check_poses,
     check_tree,
     check_views,
@@ -75,6 +75,36 @@ def test_contradiction(case):
     assert len(check_consistency(views, [0.0, between], OPTIONS)) == 1
     with pytest.raises(RefusedError, match="contradict"):
         check_consistency(views, [0.0, OPTIONS.max_disagreement + 0.01], OPTIONS)
+
+
+RAW, EXACT = False, True
+#: (calibrated, disagreement, with the pictures exchanged) -> what is said of their order
+ORDERS = [
+    (RAW, 0.12, 0.07, "swapped"), (RAW, 0.12, 0.12, "do not tell"),
+    (RAW, 0.12, 0.15, "do not tell"), (RAW, 0.12, 0.2, ""),
+    (RAW, 0.4, 0.25, "do not tell"), (RAW, 0.12, None, ""), (RAW, 0.0, 0.0, ""),
+    (EXACT, 0.14, 0.001, "swapped"), (EXACT, 0.001, 0.0001, ""), (EXACT, 0.3, 0.2, "do not tell"),
+    (EXACT, 0.07, 0.15, ""),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("calibrated", "given", "other", "said"), ORDERS)
+def test_pictures_in_the_wrong_order(calibrated, given, other, said):
+    findings, hint = check_order(("a", "b"), given, other, calibrated, OPTIONS)
+    assert len(findings) == (said != "")
+    assert all("views a and b" in text and said in text for text in findings)
+    assert hint == (findings[0] if said == "swapped" else "")
+
+
+@pytest.mark.parametrize(
+    ("error", "hint", "said"),
+    [("no tree", "swapped?", "no tree. Swapped?"), ("angles?", "swapped?", "angles? Swapped?"),
+     ("no tree", "", "no tree")],
+)  # fmt: skip
+def test_a_hint_joins_a_refusal(error, hint, said):
+    with pytest.raises(RefusedError) as refused, with_hint(hint):
+        raise RefusedError(error)
+    assert str(refused.value) == said
 
 
 def test_the_true_tree_is_ok_and_covers_everything(case):
