@@ -11,6 +11,7 @@ import click
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli_centers import centers_table, robustness
 from gcar_export.cli_evaluate import converge, evaluate
+from gcar_export.cli_gates import gate_table
 from gcar_export.cli_refine import cost_curves, refine_table, sigma_table
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -257,6 +258,7 @@ for _verb in (
     refine_table,
     cost_curves,
     sigma_table,
+    gate_table,
 ):
     main.add_command(_verb)
 
