@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions, check_options
+from gcar_deploy.config.ranges import Range, check_number
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
@@ -76,8 +77,8 @@ class Engine:
     ) -> None:
         self.options = options or RunOptions()
         check_options(self.options)
-        if threads is not None and threads < 1:
-            raise UsageError(f"threads = {threads} must be 1 or more")
+        if threads is not None:
+            check_number("threads", threads, int, Range(1, 256))
         self.threads = threads or min(os.cpu_count() or 1, 4)
         self._predictor = _load(model, self.options.predict, self.threads, session)
         self._notes: tuple[str, ...] = ()
@@ -132,8 +133,8 @@ class Engine:
         ------
         UsageError, ImageError, GeometryError, RefusedError, CancelledError, NumericalError
         """
-        if deadline_s is not None and not deadline_s > 0:
-            raise UsageError(f"deadline_s = {deadline_s:g} must be above 0")
+        if deadline_s is not None:
+            check_number("deadline_s", deadline_s, float, Range(1e-9, 1e9))
         started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
         angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)

@@ -52,6 +52,7 @@ def changed(options, path, value):
 
 FIELDS = {path: (value, rule) for path, value, rule in fields(RunOptions())}
 CASE = tiny_case()[:2]
+HULL = RunOptions(predict=PredictOptions(predictor="none"))
 
 
 def one_line_or_result(path, value):
@@ -95,6 +96,15 @@ def test_the_message_names_option_value_and_range(path, value, said, tmp_path):
         Engine(options=options)
     assert said in str(refused.value)
     assert inspect_files([tmp_path / "a", tmp_path / "b"], None, options).error.exit_code == 2
+
+
+@pytest.mark.parametrize("value", [0, -1, 257, 2.5, math.nan, math.inf, "2", True, [1]])
+def test_threads_and_deadline(value):
+    with pytest.raises(UsageError, match=r"^threads = .* must be a whole number, 1 \.\. 256$"):
+        Engine(options=HULL, threads=value)
+    if value not in (257, 2.5):
+        with pytest.raises(UsageError, match=r"^deadline_s = .* must be a number, "):
+            Engine(options=HULL, threads=1).reconstruct(*CASE, deadline_s=value)
 
 
 def test_numbers_of_other_libraries_are_numbers():

@@ -84,22 +84,29 @@ def _check(key: str, value: Any, hint: Any, rule: Range | None = None) -> None:
         hint, rule = typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, typing.cast(type, hint)):
-            raise _refusal(key, value, f"{typing.cast(type, hint).__name__}(...)")
+            raise _refusal(f"option {key}", value, f"{typing.cast(type, hint).__name__}(...)")
         check_options(value, f"{key}.")
     elif typing.get_origin(hint) is tuple:
         parts = typing.get_args(hint)
         short = not isinstance(value, tuple) or len(value) < (rule.many if rule else 0)
         if short or (parts[-1] is not Ellipsis and len(value) != len(parts)):
-            raise _refusal(key, value, f"a tuple of {rule}" if rule else "a tuple")
+            raise _refusal(f"option {key}", value, f"a tuple of {rule}" if rule else "a tuple")
         for one in value:
             _check(key, one, parts[0], rule)
     elif hint in (int, float):
-        _check_number(key, value, hint, rule)
+        check_number(f"option {key}", value, hint, rule)
     elif not isinstance(value, hint):
-        raise _refusal(key, value, {bool: "True or False", str: "text"}[hint])
+        raise _refusal(f"option {key}", value, {bool: "True or False", str: "text"}[hint])
 
 
-def _check_number(key: str, value: Any, hint: type, rule: Range | None) -> None:
+def check_number(key: str, value: Any, hint: type, rule: Range | None) -> None:
+    """Refuse what is no finite number of the type ``hint`` (int or float) within ``rule``.
+
+    Raises
+    ------
+    UsageError
+        One line that begins with ``key``.
+    """
     kind, words = (
         (numbers.Integral, "a whole number") if hint is int else (numbers.Real, "a number")
     )
@@ -111,4 +118,4 @@ def _check_number(key: str, value: Any, hint: type, rule: Range | None) -> None:
 
 
 def _refusal(key: str, value: Any, what: str) -> UsageError:
-    return UsageError(f"option {key} = {' '.join(repr(value).split())[:60]} must be {what}")
+    return UsageError(f"{key} = {' '.join(repr(value).split())[:60]} must be {what}")
