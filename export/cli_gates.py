@@ -55,11 +55,14 @@ def gate_table(
         f"Seed {seed}, gates as they are:", report.status_table(first, gates),
         f"Seed {check_seed}, gates as they are:", report.status_table(second, gates),
         "Both seeds:", report.level_table([*first, *second], gates),
+        f"Seed {seed}:", report.doubt_table(first, gates),
+        f"Seed {check_seed}:", report.doubt_table(second, gates),
         f"Gates chosen on seed {seed}, checked on {check_seed}:",
         report.gate_table(first, second, gates),
     ]  # fmt: skip
     if real:
         parts += ["Label volumes, gates as they are:", report.status_table(real, gates)]
+        parts.append(report.doubt_table(real, gates))
     text = "\n\n".join(parts)
     (out / "gates.md").write_text(text + "\n", encoding="utf-8")
     report.draw([*first, *second], gates, out / "gates.png")

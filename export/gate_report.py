@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,9 +22,10 @@ def status_table(rows: Sequence[Row], gates: QualityOptions) -> str:
     """Markdown: what becomes of each kind of pair, with the figures that decide."""
     out = [
         "| pictures | pair | n | ok / degraded / refused | told that pictures may be swapped "
-        "| disagreement % (10, 50, 90 % of pairs) | other order, ratio | least coverage % "
+        "| disagreement % (least, 10, 50, 90 % of pairs, most) | other order, ratio "
+        "| least coverage % | least support % "
         "| ok: DSC % | ok: shape mm | degraded: DSC % |",
-        "|---" * 11 + "|",
+        "|---" * 12 + "|",
     ]
     for pictures in PICTURES:
         for kind in KINDS:
@@ -40,11 +42,12 @@ def _status_line(own: Sequence[Row], pictures: str, kind: str, gates: QualityOpt
     told = sum(bool(_hint(row, gates)) for row in own)
     ratios = [r.other_order / max(r.whole.disagreement, 1e-9) for r in own if r.other_order]
     covered = [min(c or 0.0 for c in r.whole.coverage) for r in own if r.whole.coverage]
+    seen = [min(c or 0.0 for c in r.whole.support) for r in own if r.whole.support]
     ok, degraded = by[quality.OK], by[quality.DEGRADED]
     cells = [
         pictures, kind, str(len(own)), " / ".join(str(len(by[s])) for s in _STATUSES), str(told),
         _spread([r.whole.disagreement for r in own], 100), _spread(ratios, 1),
-        _spread(covered, 100), _mean([r.whole.dsc for r in ok], 100),
+        _spread(covered, 100), _spread(seen, 100), _mean([r.whole.dsc for r in ok], 100),
         _mean([r.whole.shape_mm for r in ok], 1), _mean([r.whole.dsc for r in degraded], 100),
     ]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
@@ -59,8 +62,8 @@ def _hint(row: Row, gates: QualityOptions) -> str:
 def level_table(rows: Sequence[Row], gates: QualityOptions) -> str:
     """Markdown: raw pairs of one tree by what their pictures are made of."""
     out = [
-        "| raw pictures of one tree | n | ok / degraded / refused | disagreement % (10, 50, 90 %) "
-        "| DSC %, gates open |",
+        "| raw pictures of one tree | n | ok / degraded / refused "
+        "| disagreement % (least, 10, 50, 90 % of pairs, most) | DSC %, gates open |",
         "|---" * 5 + "|",
     ]
     own = [r for r in rows if r.pictures == "raw" and r.kind == "same"]
@@ -75,6 +78,38 @@ def level_table(rows: Sequence[Row], gates: QualityOptions) -> str:
                 _mean([r.whole.dsc for r in part], 100),
             ]  # fmt: skip
             out.append("| " + " | ".join(cells) + " |")
+    return "\n".join(out)
+
+
+def doubt_table(rows: Sequence[Row], gates: QualityOptions) -> str:
+    """Markdown: what the finished tree says of raw pairs that disagree much, but are not refused.
+
+    And how many pairs would be ``ok`` if nobody asked for the other order of the pictures.
+    """
+    out = [
+        "| raw pictures | n | in doubt | of these, a view less explained than the gate "
+        "| ok | ok, other order not asked |",
+        "|---" * 6 + "|",
+    ]
+    unasked = dataclasses.replace(gates, order_ratio=0.0, swapped_ratio=0.0)
+    raw = [r for r in rows if r.pictures == "raw"]
+    groups = {
+        "one tree, comes out": [r for r in raw if r.kind == "same" and r.came_out],
+        "one tree, does not": [r for r in raw if r.kind == "same" and not r.came_out],
+        **{kind: [r for r in raw if r.kind == kind] for kind in WRONG},
+    }
+    for name, part in groups.items():
+        doubted = [
+            r for r in part
+            if gates.good_disagreement_raw < r.whole.disagreement <= gates.max_disagreement_raw
+        ]  # fmt: skip
+        short = [
+            r for r in doubted if min([c or 0.0 for c in r.whole.coverage] or [0.0])
+            < gates.good_coverage
+        ]  # fmt: skip
+        oks = [sum(replayed(r, g) == quality.OK for r in part) for g in (gates, unasked)]
+        cells = [name, *map(str, (len(part), len(doubted), len(short), *oks))]
+        out.append("| " + " | ".join(cells) + " |")
     return "\n".join(out)
 
 
@@ -97,9 +132,8 @@ def gate_table(chosen_on: Sequence[Row], checked_on: Sequence[Row], gates: Quali
 def _spread(values: Sequence[float], scale: float) -> str:
     if not values:
         return "-"
-    low, middle, high = scale * np.percentile(values, [10, 50, 90])
-    digits = 1 if scale > 1 else 2
-    return f"{low:.{digits}f}, {middle:.{digits}f}, {high:.{digits}f}"
+    found = scale * np.percentile(values, [0, 10, 50, 90, 100])
+    return ", ".join(f"{value:.3g}" for value in found)
 
 
 def _mean(values: Sequence[float | None], scale: float) -> str:

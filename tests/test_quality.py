@@ -81,7 +81,7 @@ RAW, EXACT = False, True
 #: (calibrated, disagreement, with the pictures exchanged) -> what is said of their order
 ORDERS = [
     (RAW, 0.12, 0.07, "swapped"), (RAW, 0.12, 0.12, "do not tell"),
-    (RAW, 0.12, 0.15, "do not tell"), (RAW, 0.12, 0.2, ""),
+    (RAW, 0.12, 0.14, "do not tell"), (RAW, 0.12, 0.15, ""),
     (RAW, 0.4, 0.25, "do not tell"), (RAW, 0.12, None, ""), (RAW, 0.0, 0.0, ""),
     (EXACT, 0.14, 0.001, "swapped"), (EXACT, 0.001, 0.0001, ""), (EXACT, 0.3, 0.2, "do not tell"),
     (EXACT, 0.07, 0.15, ""),

@@ -11,7 +11,7 @@ from gcar_deploy.config import QualityOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError
 from gcar_export.gate_pairs import KINDS, PICTURES, generated_subject, make_pair, real_subject
-from gcar_export.gate_report import draw, gate_table, level_table, status_table
+from gcar_export.gate_report import doubt_table, draw, gate_table, level_table, status_table
 from gcar_export.gate_table import (
     Attempt,
     Row,
@@ -154,6 +154,7 @@ def test_tables_and_picture(tmp_path):
         and "| raw | swapped | 1 | 0 / 1 / 0 | 1 |" in text
     )
     assert "| contrast 0.1 / mm | 2 | 1 / 0 / 1 |" in level_table(rows, GATES)
+    assert "| swapped | 1 | 0 | 0 | 0 | 1 |" in doubt_table(rows, GATES)
     assert "`order_ratio`" in gate_table(rows, rows, GATES)
     draw(rows, GATES, tmp_path / "gates.png")
     assert (tmp_path / "gates.png").stat().st_size > 10_000
