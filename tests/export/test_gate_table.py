@@ -23,6 +23,7 @@ from gcar_export.gate_table import (
     read_rows,
     replayed,
 )
+from gcar_export.labels import read_label
 from gcar_export.protocols import case_geometry, make_case
 from tests.conftest import data_dir
 
@@ -33,6 +34,13 @@ SEED = 50_003
 @pytest.fixture(scope="module")
 def subjects():
     return [generated_subject(SEED, k) for k in range(2)]
+
+
+def real_files():
+    for folder in (data_dir(), data_dir() / "data"):
+        if found := sorted(folder.glob("imagecas/*.label.nii.gz")):
+            return found
+    pytest.skip("GCAR_DATA has no imagecas/*.label.nii.gz")
 
 
 def row(kind="same", pictures="raw", disagreement=0.1, coverage=0.95, dsc=0.8, other=1.0, **more):
@@ -73,15 +81,9 @@ def test_raw_pairs_differ_in_what_they_are_made_of(subjects):
 
 @pytest.mark.slow
 def test_a_real_tree_gives_the_pictures_of_the_protocol():
-    files = sorted((data_dir() / "imagecas").glob("*.label.nii.gz")) or sorted(
-        (data_dir() / "data" / "imagecas").glob("*.label.nii.gz")
-    )
-    if not files:
-        pytest.skip("GCAR_DATA has no imagecas")
-    from gcar_export.labels import read_label
-
-    subject = real_subject(files[0])
-    case = make_case(read_label(files[0]), "raw")
+    file = real_files()[0]
+    subject = real_subject(file)
+    case = make_case(read_label(file), "raw")
     for view, picture in zip(
         make_pair(subject, subject, "same", "raw", 0).angiograms, case.pictures, strict=True
     ):
@@ -102,6 +104,28 @@ def test_replayed_gates_are_those_of_the_engine(subjects, kind, pictures):
     else:
         assert replayed(found, GATES) == result.status
         assert kind == "same" or result.status == "degraded"
+        assert kind == "swapped" or "swapped?" not in " ".join(result.quality.findings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pictures", PICTURES)
+def test_real_pictures_in_the_wrong_order_are_never_ok(pictures):
+    engine = Engine(threads=1)
+    for file in real_files()[::3]:
+        subject = real_subject(file)
+        said = {}
+        for kind in ("same", "swapped"):
+            pair = make_pair(subject, subject, kind, pictures, 0)
+            try:
+                result = engine.reconstruct(pair.angiograms, case_geometry("clinical", 2)[1])
+            except RefusedError as error:
+                said[kind] = str(error)
+            else:
+                said[kind] = " ".join(result.quality.findings)
+                assert kind == "same" or result.status == "degraded"
+        assert "swapped?" not in said["same"]
+        assert "swapped" in said["swapped"] or "contradict" in said["swapped"]
+        assert pictures == "raw" or "swapped?" in said["swapped"]
 
 
 @pytest.mark.parametrize(
