@@ -13,7 +13,7 @@ class TreeOptions:
     """From points to a centreline graph."""
 
     #: smoothing of the points' confidence before thresholding, lattice cells (sigma)
-    smooth_cells: Annotated[float, Range(0, 20)] = 0.6
+    smooth_cells: Annotated[float, Range(0.05, 20)] = 0.6
     #: hysteresis on the smoothed confidence: kept from ``low`` where connected to ``high``
     low: Annotated[float, Range(1e-3, 1)] = 0.08
     high: Annotated[float, Range(1e-3, 1)] = 0.25
@@ -108,8 +108,8 @@ class VolumeOptions:
     surface_sigma: Annotated[float, Range(1e-3, 100)] = 0.3
     floor_sigma: Annotated[float, Range(1e-3, 100)] = 0.03
     #: how far such differences reach along a vessel and across it, voxels (sigma)
-    along_voxels: Annotated[float, Range(0, 100)] = 1.0
-    across_voxels: Annotated[float, Range(0, 100)] = 0.6
+    along_voxels: Annotated[float, Range(0.05, 100)] = 1.0
+    across_voxels: Annotated[float, Range(0.05, 100)] = 0.6
     #: noise of the path length per pixel of about a voxel: constant part, share of the path
     noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.3
     noise_share: Annotated[float, Range(0, 100)] = 0.1
@@ -146,7 +146,7 @@ class PaperOptions:
     #: 1.1 halves Gaussians and time, and costs accuracy where the points are good
     thin_cells: Annotated[float, Range(0, 100)] = 0.0
     #: bounds of the standard deviations
-    least_sigma_pixels: Annotated[float, Range(1e-3, 100)] = 0.25
+    least_sigma_pixels: Annotated[float, Range(1e-3, 5)] = 0.25
     largest_sigma_mm: Annotated[float, Range(0.01, 1000)] = 10.0
     #: density control: steps between, pull against the mean pull, size that splits, mass that goes
     control_every: Count = 40
@@ -154,7 +154,7 @@ class PaperOptions:
     split_pixels: Annotated[float, Range(0, 1e6)] = 1.5
     least_mass_share: Share = 0.02
     #: stop when the best of so many steps is not better by this share
-    patience: Count = 20
+    patience: Annotated[int, Range(1, 1_000_000)] = 20
     tolerance: Share = 2e-3
     #: what projects: ``numpy``, or ``torch`` (the reference twin) on ``cpu`` or ``cuda``
     backend: str = "numpy"
