@@ -68,9 +68,9 @@ def predicted(predictor: Predictor, posed: Posed) -> dict[str, Points]:
             "single": merged.points_mm[merged.confidence >= 0.5],
             "single, each view": np.concatenate([view.points_mm for view in alone]),
         }
-    calibrated = all(known for _, _, known in posed.views)
+    error = 0.0 if all(known for _, _, known in posed.views) else options.imaging.contrast_error
     found = decide(
-        predictor.predict(posed.hull, posed.encoded), posed.encoded, calibrated, options.decide
+        predictor.predict(posed.hull, posed.encoded), posed.encoded, error, options.decide
     )
     offset = 0.0 if found.offset_mm is None else found.offset_mm
     return {"multi": (found.points_mm + offset)[found.confidence >= 0.5]}

@@ -304,8 +304,8 @@ def pose_table(trees: int, out: Path) -> None:
 
 @main.command("train-segmenter")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
-@click.option("--steps", default=1500, show_default=True, help="Steps in all.")
-@click.option("--decay-steps", default=600, show_default=True, help="Length of the final decay.")
+@click.option("--steps", default=2500, show_default=True, help="Steps in all.")
+@click.option("--decay-steps", default=1700, show_default=True, help="Length of the final decay.")
 @click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
 def train_segmenter(out: Path, steps: int, decay_steps: int, minutes: float | None) -> None:
     """Train the segmentation network on generated angiograms; stop and go on at will.

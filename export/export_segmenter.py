@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import INPUT, STRIDE, Segmenter
+from gcar_deploy.imaging.net import INPUT, OUTPUTS, STRIDE, Segmenter
 from gcar_export.angiograms import training_pair
 from gcar_export.export_onnx import IR_VERSION, OPSET
 from gcar_export.networks.mask_unet import MaskUNet, MaskUNetConfig
@@ -55,8 +55,9 @@ class _Deployed(torch.nn.Module):
                 if isinstance(part, torch.nn.GroupNorm):
                     level[k] = _GroupNorm(part)
 
-    def forward(self, channels: torch.Tensor) -> torch.Tensor:
-        return torch.sigmoid(self.net(channels))
+    def forward(self, channels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        logit, chord = self.net(channels).split(1, dim=1)
+        return torch.sigmoid(logit), chord
 
 
 def load_segmenter_checkpoint(path: Path) -> MaskUNet:
@@ -74,7 +75,8 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
 
     Returns
     -------
-    Largest difference of the probability between torch and ONNX Runtime.
+    Largest difference between torch and ONNX Runtime: of the probability, and of chords over
+    1 + chord.
 
     Raises
     ------
@@ -93,7 +95,7 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
         opset_version=OPSET,
         external_data=False,
         input_names=["channels"],
-        output_names=["probability"],
+        output_names=list(OUTPUTS),
         dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols},),
     )
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -124,7 +126,7 @@ def _write_spec(checkpoint: Path, out: Path, net: torch.nn.Module) -> None:
         "name": out.stem,
         "kind": "segmenter",
         "inputs": dict(INPUT),
-        "outputs": ["probability"],
+        "outputs": list(OUTPUTS),
         "opset": OPSET,
         "ir_version": IR_VERSION,
         "training": json.loads((checkpoint.parent / "manifest.json").read_text()),
@@ -144,6 +146,9 @@ def _largest_difference(net: torch.nn.Module, out: Path, pictures: int) -> float
         if k % 2:  # another shape than the one it was traced with
             channels = np.ascontiguousarray(channels[:, : -3 * STRIDE, :-STRIDE])
         with torch.no_grad():
-            a = net(torch.from_numpy(channels)[None]).numpy()[0, 0]
-        worst = max(worst, float(np.abs(a - session.probability(channels)).max()))
+            torch_maps = [m.numpy()[0, 0] for m in net(torch.from_numpy(channels)[None])]
+        seen = session.look(channels)
+        difference = np.abs(torch_maps[0] - seen.probability)
+        relative = np.abs(torch_maps[1] - seen.chord) / (1 + torch_maps[1])
+        worst = max(worst, float(difference.max()), float(relative.max()))
     return worst

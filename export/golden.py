@@ -31,7 +31,8 @@ def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
     # path_length pictures: counts times mm per count
     views = [(a.carm, a.pixels * np.float32(a.intensity.mm_per_count)) for a in angiograms]
     if model.kind == SEGMENTER:
-        noise = np.random.default_rng(0).normal(size=(1, 2, 64, 64))
+        shape = (1, int(model.inputs["channels"]), 64, 64)
+        noise = np.random.default_rng(0).normal(size=shape)
         return {"channels": np.clip(noise, -1, 2).astype(np.float32)}
     if model.kind == "single":
         picture = net_picture(*views[0], int(model.inputs["pixels"]))

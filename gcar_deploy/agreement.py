@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -19,23 +20,28 @@ from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.refine.landmarks import landmark_pixels
 from gcar_deploy.refine.pose import Pose, estimate_poses, judged_poses
 
+_log = logging.getLogger(__name__)
+
 
 def agreeing(
     angiograms: Sequence[Angiogram], views: Sequence[VesselImage], options: RunOptions
 ) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
-    """Estimate poses; where raw pictures disagree, from the largest part of each if those agree.
+    """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
+
+    First from what the network alone sees, where the classical method followed lines that have no
+    counterpart; then from the largest part of each.
 
     What was taken for vessel in one picture's background stands apart from the tree as a rule and
     has no counterpart in the other picture. Parts of a mask that the user gave are never dropped.
 
     Returns
     -------
-    views : as given, or their largest connected parts
+    views : as given, what the network alone sees of them, or their largest connected parts
     poses : one per view
     findings : that parts were left out, which makes the result ``degraded``
     """
-    poses = poses_between(views, options)
     limits = options.quality
+    views, poses = _alone_if_closer(views, options)
     worst = max(p.after for p in poses)
     if all(v.calibrated for v in views) or worst <= limits.parts_disagreement_raw:
         return list(views), poses, []
@@ -55,6 +61,22 @@ def agreeing(
         if one is not view
     ]
     return main, closer, findings
+
+
+def _alone_if_closer(
+    views: Sequence[VesselImage], options: RunOptions
+) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:
+    poses = poses_between(views, options)
+    worst = max(p.after for p in poses)
+    limits = options.quality
+    if worst <= limits.alone_disagreement_raw or all(view.alone is None for view in views):
+        return views, poses
+    alone = [view if view.alone is None else view.alone for view in views]
+    closer = poses_between(alone, options)
+    if limits.alone_ratio * max(p.after for p in closer) >= worst:
+        return views, poses
+    _log.info("the views agree better by what the network alone sees")
+    return alone, closer
 
 
 def poses_between(

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import logging
 import os
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -84,7 +85,11 @@ class Engine:
         self._notes: tuple[str, ...] = ()
         if self._predictor is None and self.options.predict.predictor != "none":
             self._notes = (_missing(self.options.predict.predictor),)
-        self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
+        check_segmenter(self.options.imaging.segmenter)
+        self._segmenter: Segmenter | None = None
+        self._segmenter_lock = threading.Lock()
+        if self.options.imaging.segmenter == "net":
+            self._needed_segmenter()
 
     @property
     def model(self) -> Mapping[str, str] | None:
@@ -103,7 +108,15 @@ class Engine:
         from gcar_deploy.selftest import tiny_case
 
         angiograms, grid, _ = tiny_case()
+        self._needed_segmenter()
         return float(self.reconstruct(angiograms, grid).seconds["total"])
+
+    def _needed_segmenter(self) -> Segmenter | None:
+        """Load the network that finds vessels once, when a picture first needs it."""
+        with self._segmenter_lock:
+            if self._segmenter is None:
+                self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
+            return self._segmenter
 
     def reconstruct(
         self,
@@ -138,13 +151,14 @@ class Engine:
         started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
         angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
+        grey = any(a.intensity.kind != "path_length" and a.mask is None for a in angiograms)
         notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
         result = reconstruct(
             angiograms,
             grid,
             self.options,
             predictor=self._predictor,
-            segmenter=self._segmenter,
+            segmenter=self._needed_segmenter() if grey else None,
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,
@@ -247,6 +261,12 @@ def with_masks(
     return out
 
 
+def check_segmenter(wanted: str) -> None:
+    """Raise UsageError where nobody of that name finds vessels."""
+    if wanted not in SEGMENTERS:
+        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(SEGMENTERS)}")
+
+
 def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
     """Load the network that finds vessels where ``wanted`` needs it.
 
@@ -257,8 +277,7 @@ def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
     ModelError
         ``net`` is wanted and the network is missing or altered.
     """
-    if wanted not in SEGMENTERS:
-        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(SEGMENTERS)}")
+    check_segmenter(wanted)
     path = shipped_model_path(SEGMENTER_MODEL)
     if wanted == "classic" or (path is None and wanted == "auto"):
         return None

@@ -93,7 +93,8 @@ def inspect_files(
             )
         found.silent += silent_errors(carms)
         found.warnings += check_views(angiograms, options.quality)
-        views, segmenter = [], load_segmenter(options.imaging.segmenter)
+        grey = any(a.intensity.kind != "path_length" and a.mask is None for a in angiograms)
+        views, segmenter = [], load_segmenter(options.imaging.segmenter) if grey else None
         for entry, angiogram in zip(found.views, angiograms, strict=True):
             view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())

@@ -217,8 +217,8 @@ def _centers(
     except CancelledError:
         watch.check()
         raise
-    calibrated = all(view.calibrated for view in views)
-    return decide(told, encoded, calibrated, options.decide), told
+    error = max(view.path_error for view in views)
+    return decide(told, encoded, error, options.decide), told
 
 
 def _vessels(

@@ -1,4 +1,4 @@
-"""A small 2D U-Net (Ronneberger et al. 2015) for vessel masks: some 0.2 M parameters."""
+"""A small 2D U-Net (Ronneberger et al. 2015) for vessel masks and chords through vessels."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+#: pixel edges per unit of the chord head
+CHORD_SCALE = 4.0
+
 
 @dataclasses.dataclass(frozen=True)
 class MaskUNetConfig:
     """Channels of the input and of each level, fine to coarse."""
 
-    channels: int = 2
-    width: tuple[int, ...] = (10, 20, 40, 80)
+    channels: int = 3
+    width: tuple[int, ...] = (16, 32, 48, 96, 128)
 
 
 class _Pair(nn.Sequential):
@@ -22,16 +25,19 @@ class _Pair(nn.Sequential):
         # Statistics over one picture: the batch is small, and at run time it is one.
         super().__init__(
             nn.Conv2d(inside, out, 3, padding=1, bias=False),
-            nn.GroupNorm(min(5, out), out),
+            nn.GroupNorm(4, out),
             nn.ReLU(),
             nn.Conv2d(out, out, 3, padding=1, bias=False),
-            nn.GroupNorm(min(5, out), out),
+            nn.GroupNorm(4, out),
             nn.ReLU(),
         )
 
 
 class MaskUNet(nn.Module):
-    """(n, channels, rows, cols) to (n, 1, rows, cols) logits; sides divisible by 8."""
+    """(n, channels, rows, cols) to (n, 2, rows, cols): vessel logits and chords in pixel edges.
+
+    Sides are divisible by 16.
+    """
 
     def __init__(self, config: MaskUNetConfig | None = None) -> None:
         super().__init__()
@@ -43,11 +49,11 @@ class MaskUNet(nn.Module):
         self.up = nn.ModuleList(
             _Pair(a + b, b) for a, b in zip(width[:0:-1], width[-2::-1], strict=True)
         )
-        self.head = nn.Conv2d(width[0], 1, 1)
+        self.head = nn.Conv2d(width[0], 2, 1)
         nn.init.constant_(self.head.bias, -2.5)  # vessels are some 7 % of a picture
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the logits."""
+        """Return logits and chords."""
         kept = []
         for k, level in enumerate(self.down):
             x = level(x if k == 0 else functional.max_pool2d(x, 2))
@@ -56,4 +62,6 @@ class MaskUNet(nn.Module):
             finer = kept[-2 - k]
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = level(torch.cat([x, finer], dim=1))
-        return self.head(x)
+        logit, chord = self.head(x).split(1, dim=1)
+        # Chords are up to 30 pixels: the head need not grow that large itself.
+        return torch.cat([logit, CHORD_SCALE * functional.softplus(chord)], dim=1)

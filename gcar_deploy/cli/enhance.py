@@ -45,10 +45,10 @@ from gcar_deploy.cli.common import chosen_dicom
 @click.option("--frame", default="auto", show_default=True, help="DICOM: frame, from 1.")
 @click.option(
     "--segmenter",
-    type=click.Choice(["classic", "net", "both"]),
-    default="classic",
+    type=click.Choice(["classic", "net", "auto", "both"]),
+    default="auto",
     show_default=True,
-    help="Who finds the vessels; both writes the network's pictures beside the others.",
+    help="Who finds the vessels; both writes classic and net_ pictures side by side.",
 )
 @click.option("--force", is_flag=True, help="Replace an existing folder.")
 def enhance(

@@ -90,12 +90,20 @@ class ImagingOptions:
     """From a picture to vessel mask, skeleton and path length. Millimetres at the isocentre."""
 
     limits: PictureLimits = dataclasses.field(default_factory=PictureLimits)
-    #: who finds vessels in grey values: ``classic``, ``net``, or ``auto`` (the network is asked
-    #: where the classical method finds none)
-    segmenter: str = "classic"
-    #: hysteresis on the network's probability
-    net_low: Share = 0.4
-    net_high: Share = 0.7
+    #: who finds vessels in grey values: ``classic``, ``net``, or ``auto`` (the mean of both, or
+    #: the network alone where the views then agree better)
+    segmenter: str = "auto"
+    #: hysteresis on the network's probability, for paths and for the mask: a path where there is
+    #: none costs less than one that is missing
+    net_path: Annotated[tuple[float, float], Range(0, 1, many=2)] = (0.6, 0.9)
+    net_mask: Annotated[tuple[float, float], Range(0, 1, many=2)] = (0.9, 0.98)
+    #: an end of a branch shallower than this share of the main vessels is a twig
+    net_twig_share: Share = 0.2
+    #: rim of the network's mask, as a share of the path in the middle: what observers draw
+    rim_share: Share = 0.65
+    #: relative error of a path that was judged from contrast, and by the network
+    contrast_error: Annotated[float, Range(0.01, 1)] = 0.25
+    chord_error: Annotated[float, Range(0.01, 1)] = 0.15
     #: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's
     #: edge p. A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns
     #: in the sampling of the picture itself.
@@ -140,5 +148,7 @@ class ImagingOptions:
     #: less skeleton than this, or a weaker peak in noise deviations, is no vessel
     min_length_mm: Length = 25.0
     min_contrast: Annotated[float, Range(0, 1e6)] = 6.0
+    #: the network tells faint vessels from noise by their shape
+    net_min_contrast: Annotated[float, Range(0, 1e6)] = 3.0
     #: and the peak, as a share of the white level, must be seen at all
     min_peak: Share = 0.03

@@ -52,7 +52,8 @@ class DecideOptions:
     enough_neighbours: Annotated[float, Range(1e-3, 1000)] = 3.0
     #: how freely a ray may differ from its path length, cells squared per unit of evidence
     looseness: Scale = 0.5
-    looseness_uncalibrated: Scale = 4.0
+    #: ... and more by this times the square of the paths' relative error
+    looseness_of_error: Annotated[float, Range(0, 1e6)] = 56.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -49,6 +49,10 @@ class QualityOptions:
     #: below this (and ``good_disagreement``) people are asked whether they swapped them: all
     #: swapped path lengths, 18 of 58 swapped raw pairs, no pair of another kind
     swapped_ratio: Annotated[float, Range(0, 1e3)] = 0.75
+    #: raw pictures that disagree by more than this are asked by the network alone, whose word is
+    #: taken where they then disagree so many times less
+    alone_disagreement_raw: Share = 0.1
+    alone_ratio: Annotated[float, Range(1, 1000)] = 1.2
     #: share of a view's skeleton that the reprojected tree explains: less than nine tenths is
     #: worth a word whatever the costs say
     good_coverage: Share = 0.9

@@ -40,11 +40,10 @@ class TubeOptions:
     levels_mm: Annotated[tuple[float, ...], Range(0, 100, many=1)] = (1.0, 0.0)
     #: most Gauss-Newton steps per level
     steps: Annotated[tuple[int, ...], Range(0, 10_000, many=1)] = (6, 5)
-    #: noise of the path length: constant part, and share of the path, per mm^2 of picture
+    #: noise of the path length: constant part, and share of the path, per mm^2 of picture; the
+    #: share is the picture's own (``VesselImage.path_error``) where that is larger
     noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.4
     noise_share: Annotated[float, Range(0, 100)] = 0.05
-    #: the share where the picture is not calibrated
-    noise_share_uncalibrated: Annotated[float, Range(0, 100)] = 0.25
     #: residuals beyond this many sigma lose weight (Cauchy)
     robust_sigmas: Annotated[float, Range(1e-3, 1e6)] = 2.0
     #: centreline: random walk of the direction, 1 / sqrt(mm)

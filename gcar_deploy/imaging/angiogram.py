@@ -100,12 +100,17 @@ class VesselImage:
     carm : CArm
         Its rows and columns are those of the arrays.
     path_mm : (rows, cols) float32
-        Millimetres of vessel along the ray of each pixel (mean over the pixel), 0 outside
-        ``mask``. An estimate unless ``calibrated``.
+        Millimetres of vessel along the ray of each pixel (mean over the pixel), 0 away from
+        vessels. An estimate unless ``calibrated``.
     calibrated : bool
         True only for ``path_length`` pictures, whose scale was given.
+    path_error : float
+        Relative standard deviation of a path; 0 where calibrated.
+    alone : VesselImage or None
+        What the network alone sees, where this is a fusion of it with another method.
     mask, skeleton, valid : (rows, cols) bool
-        Vessel; its one-pixel-wide centreline; pixels that carry a picture (no collimator).
+        Vessel as an observer draws it, at times less than ``path_mm`` covers; its
+        one-pixel-wide centreline; pixels that carry a picture (no collimator).
     kind : str
         ``path_length``, ``attenuation`` or ``raw``.
     vesselness : (rows, cols) float32 or None
@@ -127,6 +132,8 @@ class VesselImage:
     vesselness: Image | None = None
     catheter: Mask | None = None
     catheter_mm: float = 0.0
+    path_error: float = 0.0
+    alone: VesselImage | None = None
 
     def __post_init__(self) -> None:
         for array in (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter):

@@ -11,6 +11,8 @@ from gcar_deploy.errors import GeometryError, ModelError, RefusedError
 from gcar_deploy.imaging import calibrate, enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.fusion import fused
+from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.types import Image, Mask
 
@@ -32,7 +34,7 @@ def extract_vessels(
         otherwise or the picture clearly does; contrast against the filled-in background,
         scaled by the width of the vessels' shadows.
     options : ImagingOptions; ``segmenter`` says who finds vessels in grey values
-    segmenter : the network, needed for ``net`` and for the second try of ``auto``
+    segmenter : the network, needed for ``net``; without it ``auto`` is ``classic``
 
     Returns
     -------
@@ -50,18 +52,27 @@ def extract_vessels(
         raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")
     if angiogram.intensity.kind == "path_length":
         return _from_path_length(angiogram, options)
-    if options.segmenter == "net" and angiogram.mask is None:
-        return _from_grey(angiogram, options, _needed(segmenter))
-    try:
+    if angiogram.mask is not None or options.segmenter == "classic":
         return _from_grey(angiogram, options, None)
+    if options.segmenter == "net":
+        return _from_grey(angiogram, options, _needed(segmenter))
+    return _from_both(angiogram, options, segmenter)
+
+
+def _from_both(
+    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
+) -> VesselImage:
+    """Fuse both methods; where one finds no vessel, the other has the say."""
+    if segmenter is None:
+        return _from_grey(angiogram, options, None)
+    try:
+        learned = _from_grey(angiogram, options, segmenter)
     except RefusedError:
-        if options.segmenter != "auto" or segmenter is None or angiogram.mask is not None:
-            raise
-        _log.warning(
-            "view %s: the classical method finds no vessel; the network is asked",
-            angiogram.view_id,
-        )
-        return _from_grey(angiogram, options, segmenter)
+        return _from_grey(angiogram, options, None)
+    try:
+        return fused(_from_grey(angiogram, options, None), learned)
+    except RefusedError:
+        return learned
 
 
 def _needed(segmenter: Segmenter | None) -> Segmenter:
@@ -121,25 +132,56 @@ def _from_grey(
     if angiogram.valid is not None:
         holes = holes | ~angiogram.valid
     search = pictures.get("search", next(iter(pictures.values())))
+    path_mm, path_error = None, options.chord_error
     if angiogram.mask is not None:
         found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm, options)
+    elif segmenter is not None:
+        found, path_mm = learned_vessels(pictures, holes, pixel_mm, options, segmenter)
     else:
-        found = segment.segment(search, holes, pixel_mm, options, segmenter)
+        found = segment.segment(search, holes, pixel_mm, options)
     if found.catheter_mm > 0:
         _log.info(
             "view %s: %.0f mm of line taken for a catheter and left out",
             angiogram.view_id, found.catheter_mm,
         )  # fmt: skip
     length = found.skeleton.sum() * pixel_mm
-    too_faint = found.contrast < options.min_contrast or found.peak < options.min_peak
+    least = options.min_contrast if segmenter is None else options.net_min_contrast
+    too_faint = found.contrast < least or found.peak < options.min_peak
     too_faint &= angiogram.mask is None  # who draws a mask has seen the vessel
     if length < options.min_length_mm or too_faint:
         raise _nothing(
             angiogram,
             f"{length:.0f} mm of line, {found.peak:.1%} contrast, {found.contrast:.1f} times the "
             f"noise (needed: {options.min_length_mm:g} mm, {options.min_peak:.0%}, "
-            f"{options.min_contrast:g} times)",
+            f"{least:g} times)",
         )
+    if path_mm is None:
+        path_mm = _contrast_path(angiogram, pictures, found, options)
+        path_error = options.contrast_error
+    return VesselImage(
+        view_id=angiogram.view_id,
+        carm=angiogram.carm,
+        path_mm=path_mm,
+        calibrated=False,
+        mask=found.mask,
+        skeleton=found.skeleton,
+        valid=found.valid,
+        kind=kind,
+        vesselness=found.vesselness,
+        path_error=path_error,
+        catheter=found.catheter if angiogram.mask is None else None,
+        catheter_mm=found.catheter_mm,
+    )
+
+
+def _contrast_path(
+    angiogram: Angiogram,
+    pictures: dict[str, Image],
+    found: segment.Segmentation,
+    options: ImagingOptions,
+) -> Image:
+    """(rows, cols) float32, mm: contrast against the filled-in background, scaled by widths."""
+    pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     estimate = calibrate.estimate_path(
         {name: picture for name, picture in pictures.items() if name != "search"},
         found,
@@ -153,19 +195,7 @@ def _from_grey(
     )  # fmt: skip
     if estimate.mm_per_unit <= 0:
         raise _nothing(angiogram, "the lines found have no contrast")
-    return VesselImage(
-        view_id=angiogram.view_id,
-        carm=angiogram.carm,
-        path_mm=estimate.path_mm,
-        calibrated=False,
-        mask=found.mask,
-        skeleton=found.skeleton,
-        valid=found.valid,
-        kind=kind,
-        vesselness=found.vesselness,
-        catheter=found.catheter if angiogram.mask is None else None,
-        catheter_mm=found.catheter_mm,
-    )
+    return estimate.path_mm
 
 
 def is_dark(angiogram: Angiogram, options: ImagingOptions) -> bool:

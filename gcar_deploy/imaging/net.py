@@ -1,12 +1,15 @@
 """A small network that finds vessels: its input, its session, and lines from its answer.
 
-The network sees the picture at a known pixel size, flattened and scaled, beside the ridge
-response of the classical method: two channels that look much alike in generated and real
-pictures, whatever the display did to the grey values.
+The network sees the picture at a known pixel size, flattened twice and scaled, beside the ridge
+response of the classical method: three channels that look much alike in generated and real
+pictures, whatever the display did to the grey values. It answers how probably a pixel is vessel
+and how long the chord through vessel is there, in pixel edges: a vessel's width is in the picture,
+and a round vessel is as deep as it is wide.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,43 +22,61 @@ from gcar_deploy.imaging import enhance
 from gcar_deploy.types import Array, Image, Mask
 
 #: sides of the network's input are multiples of this
-STRIDE = 8
+STRIDE = 16
 #: what the spec of a fitting model says of its input
-INPUT = {"channels": 2, "stride": STRIDE}
-_CLIP = 4.0
+INPUT = {"channels": 3, "stride": STRIDE}
+OUTPUTS = ("probability", "chord")
+#: the second flattening is this much wider than the first: borders of lung and heart stay
+_WIDER = 4.0
 
 
-def net_input(flat: Image, response: Image, valid: Mask) -> Array:
-    """Scale a flattened picture and its ridge response for the network.
+def net_input(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions) -> Array:
+    """Make the network's input from a picture at working size.
 
     Parameters
     ----------
-    flat : (rows, cols) float32, vessels bright, slow background taken away
-    response : (rows, cols) float32, as ``enhance.ridges`` gives it
-    valid : (rows, cols) bool
+    picture : (rows, cols) float32, vessels bright
+    holes : (rows, cols) bool, pixels without picture
+    pixel_mm : float, pixel size at the isocentre
+    options : ImagingOptions
 
     Returns
     -------
-    (2, rows, cols) float32: units of robust standard deviations and of the 99th percentile,
-    clipped; 0 where there is no picture
+    (3, rows, cols) float32
+        asinh of the picture without what varies slowly and without what varies very slowly, in
+        robust standard deviations, and the ridge response in units of its 99th percentile, 0 .. 2;
+        0 where there is no picture. A gain or an offset of ``picture`` changes nothing.
     """
-    inside = valid if valid.any() else np.ones_like(valid)
-    middle = float(np.median(flat[inside]))
-    # Vessels are in the upper tail: the spread is that of what lies below the median.
-    low = middle - float(np.percentile(flat[inside], 16))
+    filled = enhance.fill_holes(picture, holes)
+    sigma = options.flatten_sigma_mm / pixel_mm
+    flat = enhance.flatten(filled, sigma)
+    response = np.where(holes, np.float32(0), enhance.ridges(flat, pixel_mm, options).response)
+    inside = ~holes if not holes.all() else np.ones_like(holes)
+    low, middle = np.percentile(flat[inside], [16, 50])
     top = float(np.percentile(response[inside], 99))
-    picture = np.clip((flat - middle) / max(low, 1e-9), -_CLIP, 2 * _CLIP) / _CLIP
+    # Vessels are in the upper tail: the spread is that of what lies below the median.
+    scale = np.float32(max(float(middle - low), 1e-9))
+    near = np.arcsinh((flat - np.float32(middle)) / scale)
+    wide = enhance.flatten(filled, _WIDER * sigma)
+    far = np.arcsinh((wide - np.float32(np.median(wide[inside]))) / scale)
     ridge = np.clip(response / max(top, 1e-9), 0.0, 2.0)
-    out = np.stack([picture, ridge]).astype(np.float32)
-    out[:, ~valid] = 0.0
+    out = np.stack([near / 2, far / 2, ridge]).astype(np.float32)
+    out[:, holes] = 0.0
     return out
 
 
-def prepared(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions) -> Array:
-    """Make the network's input from a picture at working size; see ``net_input``."""
-    flat = enhance.flatten(enhance.fill_holes(picture, holes), options.flatten_sigma_mm / pixel_mm)
-    response = enhance.ridges(flat, pixel_mm, options).response
-    return net_input(flat, np.where(holes, np.float32(0), response), ~holes)
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seen:
+    """Answer of the network.
+
+    Attributes
+    ----------
+    probability : (rows, cols) float32, 0 .. 1, that the pixel is coronary vessel
+    chord : (rows, cols) float32, >= 0, through vessel along the pixel's ray, pixel edges
+    """
+
+    probability: Image
+    chord: Image
 
 
 class Segmenter:
@@ -105,16 +126,12 @@ class Segmenter:
         """Names of the graph's outputs."""
         return [node.name for node in self._session.get_outputs()]
 
-    def probability(self, channels: Array) -> Image:
-        """Return the vessel probability of each pixel.
+    def look(self, channels: Array) -> Seen:
+        """Return what the network sees in a picture.
 
         Parameters
         ----------
-        channels : (2, rows, cols) float32, from ``net_input``
-
-        Returns
-        -------
-        (rows, cols) float32, 0 .. 1
+        channels : (3, rows, cols) float32, from ``net_input``
 
         Raises
         ------
@@ -126,7 +143,8 @@ class Segmenter:
         padded = np.stack(
             [cv2.copyMakeBorder(c, 0, down, 0, right, cv2.BORDER_REPLICATE) for c in channels]
         )
-        out = self.run(None, {"channels": padded[None]})[0]
-        if out.shape != (1, 1, rows + down, cols + right) or not np.isfinite(out).all():
-            raise NumericalError(f"model {self.name} returned values that are not finite")
-        return np.asarray(out[0, 0, :rows, :cols], dtype=np.float32)
+        maps = self.run(list(OUTPUTS), {"channels": padded[None]})
+        for out in maps:
+            if out.shape != (1, 1, rows + down, cols + right) or not np.isfinite(out).all():
+                raise NumericalError(f"model {self.name} returned values that are not finite")
+        return Seen(*(np.ascontiguousarray(m[0, 0, :rows, :cols], np.float32) for m in maps))

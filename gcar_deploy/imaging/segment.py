@@ -11,7 +11,6 @@ from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
-from gcar_deploy.imaging.net import Segmenter, net_input
 from gcar_deploy.types import Array, Image, Mask
 
 
@@ -51,7 +50,6 @@ def segment(
     holes: Mask,
     pixel_mm: float,
     options: ImagingOptions,
-    segmenter: Segmenter | None = None,
 ) -> Segmentation:
     """Find bright vessels.
 
@@ -64,22 +62,13 @@ def segment(
     holes : (rows, cols) bool, pixels without picture (collimator)
     pixel_mm : float, pixel size at the isocentre
     options : ImagingOptions
-    segmenter : the network that draws the centreline in place of the ridge filter's hysteresis
     """
     rows, columns = picture.shape
-    scale = min(1.0, pixel_mm / options.work_pixel_mm)
-    size = (max(16, round(columns * scale)), max(16, round(rows * scale)))
-    work = resize(enhance.fill_holes(picture, holes), size)
-    work_holes = resize(holes.astype(np.float32), size) > 0.1
-    work_mm = pixel_mm * columns / size[0]
+    work, work_holes, work_mm = at_working_size(picture, holes, pixel_mm, options)
     flat = enhance.flatten(work, options.flatten_sigma_mm / work_mm)
     found = enhance.ridges(flat, work_mm, options)
     response = np.where(work_holes, np.float32(0), found.response)
-    if segmenter is None:
-        line = centreline(response, ~work_holes, work_mm, options)
-    else:
-        sure = segmenter.probability(net_input(flat, response, ~work_holes))
-        line = learned_centreline(sure, ~work_holes, work_mm, options)
+    line = centreline(response, ~work_holes, work_mm, options)
     taken = np.zeros_like(line)
     if options.catheter.reject:
         taken = catheters(line, flat, found.sigma_px, ~work_holes, work_mm, options.catheter)
@@ -110,6 +99,17 @@ def segment(
     )
 
 
+def at_working_size(
+    picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions
+) -> tuple[Image, Mask, float]:
+    """Return picture, holes and pixel size for the search; coarser pictures keep their own."""
+    rows, columns = picture.shape
+    scale = min(1.0, pixel_mm / options.work_pixel_mm)
+    size = (max(16, round(columns * scale)), max(16, round(rows * scale)))
+    work = resize(enhance.fill_holes(picture, holes), size)
+    return work, resize(holes.astype(np.float32), size) > 0.1, pixel_mm * columns / size[0]
+
+
 def centreline(response: Image, valid: Mask, pixel_mm: float, options: ImagingOptions) -> Mask:
     """(rows, cols) bool: hysteresis, small parts, straight wires, spurs and weak ends."""
     if not valid.any():
@@ -125,19 +125,6 @@ def centreline(response: Image, valid: Mask, pixel_mm: float, options: ImagingOp
     if not line.any():
         return line
     return skel.strong_parts(line, response, options.part_share)
-
-
-def learned_centreline(
-    probability: Image, valid: Mask, pixel_mm: float, options: ImagingOptions
-) -> Mask:
-    """(rows, cols) bool: skeleton of what the network calls vessel, without small parts."""
-    sure = np.where(valid, probability, np.float32(0))
-    inside = skel.parts_touching(sure >= options.net_low, sure >= options.net_high)
-    line = skel.skeletonize(inside)
-    if not line.any():
-        return line
-    line = skel.prune(line, sure, options.spur_mm / pixel_mm, 0.0)
-    return skel.strong_parts(line, sure, options.part_share) if line.any() else line
 
 
 def given(

@@ -27,7 +27,7 @@ from gcar_deploy.types import Array, Scalars
 
 
 def decide(
-    centers: CenterPoints, encoded: Encoded, calibrated: bool, options: DecideOptions
+    centers: CenterPoints, encoded: Encoded, path_error: float, options: DecideOptions
 ) -> CenterPoints:
     """Sharpen the confidences of ``centers``; points, order and count stay as they are.
 
@@ -35,11 +35,11 @@ def decide(
     ----------
     centers : CenterPoints, one per candidate of ``encoded``
     encoded : Encoded
-    calibrated : bool, whether path lengths are true mm in every view
+    path_error : float, relative error of the paths; 0 only where they are true mm in every view
     options : DecideOptions
     """
     evidence = logit(np.clip(centers.confidence, 1e-4, 1 - 1e-4))
-    views = _Rays.of(encoded, centers.confidence, calibrated, options)
+    views = _Rays.of(encoded, centers.confidence, path_error, options)
     x = expit(evidence)
     neighbours = _adjacent(encoded.neighbours[0])
     for step in range(options.steps):
@@ -74,15 +74,15 @@ class _Rays:
     looseness: float
 
     @staticmethod
-    def of(encoded: Encoded, expected: Scalars, calibrated: bool, options: DecideOptions) -> _Rays:
+    def of(encoded: Encoded, expected: Scalars, path_error: float, options: DecideOptions) -> _Rays:
         path = []
         for ray, p, w in zip(encoded.ray, encoded.ray_path, encoded.weight, strict=True):
             # Padding rays behind no point have no say.
             seen = p[: int(ray.max()) + 1].astype(np.float64) if len(ray) else p[:0]
-            if not calibrated:
+            if path_error > 0:
                 seen = seen * np.clip((expected * w).sum() / max(seen.sum(), 1e-9), 0.25, 4.0)
             path.append(seen)
-        loose = options.looseness if calibrated else options.looseness_uncalibrated
+        loose = options.looseness + options.looseness_of_error * path_error**2
         weight = encoded.weight.astype(np.float64)
         return _Rays(encoded.ray, path, weight, [np.zeros(len(p)) for p in path], loose)
 

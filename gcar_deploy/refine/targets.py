@@ -15,8 +15,8 @@ from gcar_deploy.types import Array
 
 #: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
 COARSE_BLUR_PX = 0.6
-#: bounds of the contrast factor of a picture that is not calibrated.
-CONTRAST_BOUNDS = (0.4, 2.5)
+#: how many of the paths' relative errors the contrast factor may be off.
+CONTRAST_SIGMAS = 6.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,6 +32,7 @@ class Target:
     box_px : float, width of the averaging box in the model, pixels
     pixel_mm : float, pixel edge at the isocentre
     calibrated : bool
+    path_error : float, relative, of paths that are not calibrated
     contrast : float, factor on the model, 1 for calibrated pictures
     empty_cost : float, sum over pixels of weight log(1 + (path / (c sigma))^2), the robust
         cost of an empty model
@@ -44,6 +45,7 @@ class Target:
     box_px: float
     pixel_mm: float
     calibrated: bool = True
+    path_error: float = 0.0
     contrast: float = 1.0
     empty_cost: float = 0.0
 
@@ -56,7 +58,8 @@ class Target:
         if power <= 0:
             return self
         factor = float((w * model * self.path_mm).sum()) / power
-        return dataclasses.replace(self, contrast=float(np.clip(factor, *CONTRAST_BOUNDS)))
+        most = 1 + CONTRAST_SIGMAS * self.path_error
+        return dataclasses.replace(self, contrast=float(np.clip(factor, 1 / most, most)))
 
 
 def make_targets(
@@ -91,7 +94,7 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
     if level_mm:
         path = cv2.GaussianBlur(path, (0, 0), COARSE_BLUR_PX)
         variance += COARSE_BLUR_PX**2
-    share = options.noise_share if view.calibrated else options.noise_share_uncalibrated
+    share = max(options.noise_share, view.path_error)
     path = path.astype(np.float64)
     sigma = options.noise_mm + share * path
     some = path > 0
@@ -104,6 +107,7 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
         box_px=max(float(np.sqrt(12 * variance)), 0.05),
         pixel_mm=carm.pixel_at_isocenter_mm,
         calibrated=view.calibrated,
+        path_error=view.path_error,
         empty_cost=float((np.log1p(z * z) * weight[some]).sum()),
     )
 

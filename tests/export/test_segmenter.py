@@ -11,13 +11,26 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 from gcar_deploy.config import ImagingOptions  # noqa: E402
 from gcar_deploy.errors import ModelError  # noqa: E402
 from gcar_deploy.imaging.extract import extract_vessels  # noqa: E402
+from gcar_deploy.imaging.learned import support  # noqa: E402
 from gcar_deploy.imaging.net import INPUT, Segmenter, net_input  # noqa: E402
-from gcar_deploy.imaging.segment import learned_centreline  # noqa: E402
 from gcar_deploy.predict.model_spec import read_model  # noqa: E402
-from gcar_export.angiograms import SIDE, generated_angiogram, training_pair  # noqa: E402
+from gcar_export.angiogram_vessels import Vessels, catheter, random_vessels, ribbon  # noqa: E402
+from gcar_export.angiograms import (  # noqa: E402
+    SIDE,
+    generated_angiogram,
+    picture_with_mask,
+    training_pair,
+)
 from gcar_export.export_segmenter import _GroupNorm, export_segmenter  # noqa: E402
 from gcar_export.networks.mask_unet import MaskUNet  # noqa: E402
-from gcar_export.train_segmenter import TINY, learning_rate, train  # noqa: E402
+from gcar_export.train_segmenter import (  # noqa: E402
+    TINY,
+    chord_loss,
+    learning_rate,
+    mask_loss,
+    total_loss,
+    train,
+)
 from tests.imaging.phantoms import angiogram, raw_picture, tube_paths  # noqa: E402
 
 
@@ -30,33 +43,89 @@ def test_pictures_are_functions_of_their_number():
 
 def test_vessels_are_darker_than_what_surrounds_them():
     darker = []
-    for i in range(8):
+    for i in range(12):
         made = generated_angiogram(6, i)
         near = cv2.dilate(made.mask.astype(np.uint8), np.ones((9, 9))) > 0
         ring = near & ~(cv2.dilate(made.mask.astype(np.uint8), np.ones((5, 5))) > 0)
         darker.append(made.pixels[made.mask].mean() < made.pixels[ring].mean())
-        assert 0.003 < made.mask.mean() < 0.4
+        assert 0.003 < made.mask.mean() < 0.5
+        assert not (made.mask & made.unsure).any()
+        assert (made.path_px[made.mask] > 0.8).all() and made.path_px.max() < SIDE
+        assert picture_with_mask(made).shape == (SIDE, 2 * SIDE, 3)
     assert np.mean(darker) > 0.9
+
+
+def test_chords_are_those_of_a_round_tube():
+    """Half-way along a drawn ribbon the profile is near sqrt(1 - x^2), its middle the width."""
+    out = np.zeros((80, 80), np.float32)
+    ribbon(out, np.array([[10.0, 40.0], [70.0, 40.0]]), 12.0, 12.0)
+    profile = out[:, 40]
+    x = (np.arange(80) - 39.6) / 6.0  # drawn a fraction of a pixel off, picture and truth alike
+    true = 12 * np.sqrt(np.clip(1 - x * x, 0, None))
+    assert profile.max() == pytest.approx(12, rel=0.05)
+    assert np.abs(profile - true)[np.abs(x) < 0.8].max() < 2.0
+    assert abs(profile.sum() - true.sum()) < 0.2 * true.sum()
+    assert not out[:, :3].any() and not out[:, 77:].any()
+
+
+def test_a_catheter_comes_from_a_border_and_is_no_vessel():
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        vessels = random_vessels(rng, SIDE, 0.4)
+        assert np.hypot(*vessels.heading) == pytest.approx(1)
+        assert vessels.path_px.min() >= 0 and vessels.path_px.max() > 2
+    still = Vessels(
+        path_px=np.zeros((SIDE, SIDE), np.float32),
+        doubtful=np.zeros((SIDE, SIDE), bool),
+        ostium=np.array([128.0, 128.0]),
+        heading=np.array([0.0, 1.0]),
+    )
+    rim = np.ones((SIDE, SIDE), bool)
+    rim[2:-2, 2:-2] = False
+    for k in range(8):
+        assert (catheter(np.random.default_rng(k), still, 0.4)[rim] > 0.3).any()
+    # Only the spilled contrast is wider than the tube itself.
+    widths = [catheter(np.random.default_rng(k), still, 0.4).max() for k in range(12)]
+    assert np.min(widths) < 2.7 / 0.4
 
 
 def test_input_and_truth_belong_together():
     """The network's own channels are larger on vessel than off it, flips included."""
     for i in range(4):
         channels, truth = training_pair(7, i, ImagingOptions())
-        assert channels.shape == (2, SIDE, SIDE) and channels.dtype == np.float32
-        on, off = channels[:, truth > 0].mean(axis=1), channels[:, truth == 0].mean(axis=1)
+        assert channels.shape == (3, SIDE, SIDE) and channels.dtype == np.float32
+        assert truth.shape == (3, SIDE, SIDE) and truth.dtype == np.float32
+        vessel, asked, chord = truth
+        assert set(np.unique(vessel)) <= {0.0, 1.0} and set(np.unique(asked)) <= {0.0, 1.0}
+        assert (chord[vessel > 0] > 0.8).all() and (asked[vessel > 0] == 1).all()
+        on, off = channels[:, vessel > 0].mean(axis=1), channels[:, chord == 0].mean(axis=1)
         assert (on > off).all()
 
 
 def test_input_does_not_depend_on_gain_or_offset():
     rng = np.random.default_rng(0)
-    flat, response = rng.normal(size=(2, 40, 48)).astype(np.float32)
-    valid = np.ones((40, 48), bool)
-    valid[:4] = False
-    one = net_input(flat, np.abs(response), valid)
-    other = net_input(7 * flat + 3, 7 * np.abs(response), valid)
-    np.testing.assert_allclose(one, other, atol=1e-5)
-    assert not one[:, :4].any()
+    picture = cv2.GaussianBlur(rng.normal(size=(64, 80)).astype(np.float32), (0, 0), 2)
+    holes = np.zeros((64, 80), bool)
+    holes[:4] = True
+    one = net_input(picture, holes, 0.5, ImagingOptions())
+    other = net_input(7 * picture + 3, holes, 0.5, ImagingOptions())
+    np.testing.assert_allclose(one, other, atol=2e-3)
+    assert not one[:, :4].any() and np.isfinite(one).all()
+
+
+def test_losses_are_least_at_the_truth():
+    torch.manual_seed(0)
+    truth = (torch.rand(2, 20, 20) > 0.7).float()
+    weight = (torch.rand(2, 20, 20) > 0.2).float()
+    right = 20 * (truth - 0.5)
+    assert mask_loss(right, truth, weight) < 0.05 < 1 < mask_loss(-right, truth, weight)
+    # What has no weight is asked neither way.
+    other = torch.where(weight > 0, right, -right)
+    torch.testing.assert_close(mask_loss(other, truth, weight), mask_loss(right, truth, weight))
+    chord = 5 * torch.rand(2, 20, 20)
+    assert chord_loss(chord, chord, weight) == 0 < chord_loss(chord + 0.1, chord, weight)
+    both = torch.stack([right, chord], 1)
+    assert total_loss(both, torch.stack([truth, weight, chord], 1)) < 0.05
 
 
 def test_schedule():
@@ -93,10 +162,12 @@ def test_the_runtime_reads_and_runs_it(trained):
     model = read_model(trained / "tiny.onnx", wanted=INPUT)
     segmenter = Segmenter(model.data, model.name, threads=1)
     rng = np.random.default_rng(1)
-    found = segmenter.probability(rng.normal(size=(2, 61, 83)).astype(np.float32))
-    assert found.shape == (61, 83) and (found >= 0).all() and (found <= 1).all()
+    seen = segmenter.look(rng.normal(size=(3, 61, 83)).astype(np.float32))
+    assert seen.probability.shape == seen.chord.shape == (61, 83)
+    assert (seen.probability >= 0).all() and (seen.probability <= 1).all()
+    assert (seen.chord >= 0).all() and np.isfinite(seen.chord).all()
     with pytest.raises(ModelError, match=r"wants inputs\.channels"):
-        read_model(trained / "tiny.onnx", wanted={**INPUT, "channels": 3})
+        read_model(trained / "tiny.onnx", wanted={**INPUT, "channels": 2})
     with pytest.raises(ModelError, match="segmenter"):
         read_model(trained / "tiny.onnx")
 
@@ -112,24 +183,23 @@ def test_who_is_asked(trained):
     assert found.mask.any()
 
 
-def test_lines_from_a_certain_probability():
-    """A drawn line with a gap below the lower threshold, and a faint stroke of its own."""
+def test_support_from_a_certain_probability():
+    """A drawn line, a faint stroke of its own, and a speck."""
     sure = np.zeros((120, 120), np.float32)
-    cv2.line(sure, (10, 60), (110, 60), 0.95, 5)
-    cv2.line(sure, (10, 20), (110, 20), 0.5, 5)  # never above the upper threshold
-    line = learned_centreline(sure, np.ones((120, 120), bool), 0.5, ImagingOptions())
-    rows, _ = np.nonzero(line)
-    assert rows.size > 80 and set(rows) <= {59, 60, 61}
-    nothing = learned_centreline(0 * sure, np.ones((120, 120), bool), 0.5, ImagingOptions())
-    assert not nothing.any()
+    cv2.line(sure, (10, 60), (110, 60), 0.99, 5)
+    cv2.line(sure, (10, 20), (110, 20), 0.9, 5)  # never above the upper threshold
+    cv2.circle(sure, (60, 100), 4, 0.99, -1)  # too short to be a vessel
+    reach = support(sure, 5 * sure, 0.5, ImagingOptions(), (0.7, 0.95))
+    assert reach[60, 10:110].all() and not reach[:40].any() and not reach[80:].any()
+    assert not support(0 * sure, sure, 0.5, ImagingOptions(), (0.7, 0.95)).any()
 
 
 def test_size_of_the_network():
-    assert 150_000 < sum(p.numel() for p in MaskUNet().parameters()) < 500_000
+    assert 500_000 < sum(p.numel() for p in MaskUNet().parameters()) < 1_000_000
 
 
 def test_the_exported_norm_is_the_trained_one():
-    norm = torch.nn.GroupNorm(5, 20)
+    norm = torch.nn.GroupNorm(4, 20)
     with torch.no_grad():
         norm.weight.uniform_(0.5, 2.0)
         norm.bias.uniform_(-1.0, 1.0)

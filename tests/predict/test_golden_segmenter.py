@@ -20,12 +20,12 @@ from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 @pytest.fixture
 def model(tmp_path, monkeypatch):
     """A network of one convolution, where the engine looks for the shipped one."""
-    weight = numpy_helper.from_array(np.full((1, 2, 1, 1), 0.5, np.float32), "w")
+    weight = numpy_helper.from_array(np.full((1, INPUT["channels"], 1, 1), 0.5, np.float32), "w")
     nodes = [
         helper.make_node("Conv", ["channels", "w"], ["h"]),
         helper.make_node("Sigmoid", ["h"], ["p"]),
     ]
-    shape = ["n", 2, "rows", "cols"]
+    shape = ["n", INPUT["channels"], "rows", "cols"]
     x = helper.make_tensor_value_info("channels", TensorProto.FLOAT, shape)
     y = helper.make_tensor_value_info("p", TensorProto.FLOAT, ["n", 1, "rows", "cols"])
     graph = helper.make_graph(nodes, "g", [x], [y], [weight])
@@ -50,7 +50,7 @@ def test_the_case_is_made_and_checked_at_load(model):
     assert golden.write_golden(path).exists()
     assert engine.load_segmenter("net") is not None
     made.graph.initializer[0].CopyFrom(
-        numpy_helper.from_array(np.full((1, 2, 1, 1), 0.6, np.float32), "w")
+        numpy_helper.from_array(np.full((1, INPUT["channels"], 1, 1), 0.6, np.float32), "w")
     )
     write(path, made)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()

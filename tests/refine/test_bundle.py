@@ -43,7 +43,7 @@ def scene(count, seed):
         mask = path > 0.1
         views.append(
             VesselImage(
-                view_id="1", carm=told, path_mm=path, calibrated=False, mask=mask,
+                view_id="1", carm=told, path_mm=path, calibrated=False, mask=mask, path_error=0.25,
                 skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="raw",
             )
         )  # fmt: skip

@@ -1,0 +1,58 @@
+"""What the classical method and the network see of one picture, as one vessel image."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.learned import nearest
+from gcar_deploy.types import Mask
+
+
+def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
+    """Return the mean of both paths and what both draw.
+
+    Their errors have little in common: the one follows any line, however faint, and its contrast
+    holds all that lies there; the other knows what a vessel looks like and is coarse. The classical
+    paths are first brought to the scale of the network's, which is the better known.
+
+    Parameters
+    ----------
+    classic, learned : of the same picture
+
+    Returns
+    -------
+    VesselImage ; its ``alone`` is ``learned``
+    """
+    ours, theirs = classic.path_mm.astype(np.float64), learned.path_mm.astype(np.float64)
+    both = (ours > 0) & (theirs > 0)
+    power = float((ours[both] ** 2).sum())
+    scale = float((ours[both] * theirs[both]).sum()) / power if power > 0 else 1.0
+    mask = _drawn(classic, learned)
+    return dataclasses.replace(
+        learned,
+        path_mm=(0.5 * (scale * ours + theirs)).astype(np.float32),
+        mask=mask,
+        skeleton=skel.skeletonize(mask),
+        alone=learned,
+        catheter=_either(classic, learned, mask),
+        catheter_mm=max(classic.catheter_mm, learned.catheter_mm),
+    )
+
+
+def _drawn(classic: VesselImage, learned: VesselImage) -> Mask:
+    """Where both draw, along lines that both follow, and where the network is sure on its own."""
+    near = cv2.dilate((learned.path_mm > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    followed = nearest(classic.mask, classic.skeleton, classic.skeleton & near)
+    beside = cv2.dilate(classic.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    rims = learned.mask | (learned.path_mm > 0) | classic.skeleton
+    return (followed & rims) | (learned.mask & ~beside)
+
+
+def _either(classic: VesselImage, learned: VesselImage, mask: Mask) -> Mask:
+    found = [view.catheter for view in (classic, learned) if view.catheter is not None]
+    return np.logical_or.reduce([np.zeros_like(mask), *found]) & ~mask

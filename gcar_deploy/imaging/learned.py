@@ -1,0 +1,174 @@
+"""Vessels of a picture as the network sees them: mask, skeleton and path lengths.
+
+The network says where vessels are and how deep they look: that holds in clutter, but is as coarse
+as its input. The contrast against what surrounds the vessels is fine, but of unknown scale and
+full of whatever else is there. So the network's support and chords give the contrast its scale,
+and the path length is the mean of both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.imaging import enhance, segment
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.catheter import catheters
+from gcar_deploy.imaging.net import Segmenter, net_input
+from gcar_deploy.types import Image, Mask
+
+#: paths are averaged over so much of the line before they say where the rim is, mm
+_SMOOTH_MM = 1.5
+
+
+def learned_vessels(
+    pictures: Mapping[str, Image],
+    holes: Mask,
+    pixel_mm: float,
+    options: ImagingOptions,
+    segmenter: Segmenter,
+) -> tuple[segment.Segmentation, Image]:
+    """Find bright vessels and how deep they are.
+
+    Parameters
+    ----------
+    pictures : name -> (rows, cols) float32, vessels bright
+        ``search`` is what the network sees (the first where there is none), the others are linear
+        in the path if their law of grey values holds.
+    holes : (rows, cols) bool, pixels without picture (collimator)
+    pixel_mm : float, pixel size at the isocentre
+    options : ImagingOptions
+    segmenter : Segmenter
+
+    Returns
+    -------
+    found : Segmentation, at the picture's own size
+        The mask ends where an observer sees the rim, at a share of the path in the middle; its
+        ``vesselness`` is the network's probability.
+    path_mm : (rows, cols) float32
+        Length of the ray within vessel, 0 away from vessels; it reaches beyond the mask.
+    """
+    search = pictures.get("search", next(iter(pictures.values())))
+    work, work_holes, work_mm = segment.at_working_size(search, holes, pixel_mm, options)
+    seen = segmenter.look(net_input(work, work_holes, work_mm, options))
+    full = search.shape[::-1]
+    probability = np.where(work_holes, np.float32(0), seen.probability)
+    reach = support(probability, seen.chord, work_mm, options, options.net_path)
+    reach, device = _without_catheters(reach, work, work_holes, work_mm, options)
+    near = (segment.resize(reach.astype(np.float32), full) >= 0.5) & ~holes
+    sure = support(probability, seen.chord, work_mm, options, options.net_mask) & reach
+    chord = np.where(near, segment.resize(seen.chord, full) * np.float32(work_mm), np.float32(0))
+    laws = {name: picture for name, picture in pictures.items() if name != "search"}
+    contrast = _scaled_contrast(laws, holes, near, chord, pixel_mm, options)
+    path = np.asarray(0.5 * (chord + contrast), dtype=np.float32)
+    surely = (segment.resize(sure.astype(np.float32), full) >= 0.5) & near
+    mask = _drawn(path, surely, pixel_mm, options)
+    found = dataclasses.replace(
+        segment.given(search, mask, holes, pixel_mm, options),
+        vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
+        catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~near,
+        catheter_mm=int(skel.skeletonize(device).sum()) * work_mm,
+    )
+    return found, path
+
+
+def support(
+    probability: Image,
+    chord: Image,
+    pixel_mm: float,
+    options: ImagingOptions,
+    levels: tuple[float, float],
+) -> Mask:
+    """Where vessels are: hysteresis on the probability, without twigs and small parts.
+
+    Parameters
+    ----------
+    probability, chord : (rows, cols) float32, as the network says them
+    pixel_mm : float
+    options : ImagingOptions
+    levels : lower and upper one of the hysteresis
+
+    Returns
+    -------
+    (rows, cols) bool, out to where a vessel fades
+    """
+    reach = skel.parts_touching(probability >= levels[0], probability >= levels[1])
+    line = whole = skel.skeletonize(reach)
+    if not line.any():
+        return reach & False
+    deep = np.asarray(cv2.GaussianBlur(chord, (0, 0), 0.7), dtype=np.float32)
+    top = float(np.percentile(deep[line], 90))
+    line = skel.prune(line, deep, options.spur_mm / pixel_mm, options.net_twig_share * top)
+    if line.any():
+        line = skel.strong_parts(line, deep, options.part_share)
+    return nearest(reach, whole, line)
+
+
+def nearest(reach: Mask, whole: Mask, kept: Mask) -> Mask:
+    """Pixels of ``reach`` whose nearest pixel of the line ``whole`` is, or touches, a kept one."""
+    if not kept.any():
+        return np.zeros_like(reach)
+    near = cv2.dilate(kept.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    _, label = cv2.distanceTransformWithLabels(
+        (~whole).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(label.max()) + 1, bool)
+    table[label[whole]] = near[whole]
+    return reach & table[label]
+
+
+def _without_catheters(
+    reach: Mask, work: Image, holes: Mask, pixel_mm: float, options: ImagingOptions
+) -> tuple[Mask, Mask]:
+    """(rows, cols) bool each: what stays vessel, and what is taken for a catheter."""
+    line = skel.skeletonize(reach)
+    taken = np.zeros_like(reach)
+    if options.catheter.reject and line.any():
+        flat = enhance.flatten(work, options.flatten_sigma_mm / pixel_mm)
+        width = enhance.ridges(flat, pixel_mm, options).sigma_px
+        taken = catheters(line, flat, width, ~holes, pixel_mm, options.catheter)
+    if not taken.any():
+        return reach, taken
+    kept = nearest(reach, line, line & ~taken)
+    return kept, reach & ~kept
+
+
+def _scaled_contrast(
+    laws: Mapping[str, Image],
+    holes: Mask,
+    near: Mask,
+    chord: Image,
+    pixel_mm: float,
+    options: ImagingOptions,
+) -> Image:
+    """(rows, cols) float32, mm: contrast under the law that agrees best with the chords."""
+    best, agreement = np.zeros_like(chord), -np.inf
+    if not near.any():
+        return best
+    margin, fill = options.margin_mm / pixel_mm, options.fill_sigma_mm / pixel_mm
+    for picture in laws.values():
+        filled = enhance.fill_holes(picture, holes)
+        rise = np.clip(filled - enhance.background(filled, near, margin, fill), 0, None)
+        c, q = rise[near].astype(np.float64), chord[near].astype(np.float64)
+        if not c.any() or not q.any():
+            continue
+        alike = float((c * q).sum() / np.sqrt((c * c).sum() * (q * q).sum()))
+        if alike > agreement:
+            scale = np.float32((c * q).sum() / (c * c).sum())
+            best, agreement = np.where(near, rise * scale, np.float32(0)), alike
+    return best if agreement > -np.inf else chord
+
+
+def _drawn(path: Image, near: Mask, pixel_mm: float, options: ImagingOptions) -> Mask:
+    """(rows, cols) bool: where an observer would draw the rims, and no thinner than a line."""
+    line = skel.skeletonize(near)
+    if not line.any():
+        return line
+    line = skel.prune(line, path, options.spur_mm / pixel_mm, 0.0)
+    smooth = cv2.GaussianBlur(path, (0, 0), max(0.7, 0.35 / pixel_mm))
+    _, (peak,) = skel.spread(line, (smooth,), _SMOOTH_MM / pixel_mm)
+    return ((smooth > options.rim_share * peak) | line) & near
