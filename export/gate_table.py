@@ -24,6 +24,7 @@ Pairs off by a shift or an angle do not count: what comes of them is stated besi
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Callable, Sequence
@@ -34,9 +35,11 @@ import numpy as np
 
 from gcar_deploy import agreement, quality
 from gcar_deploy.config import QualityOptions, RunOptions
-from gcar_deploy.engine import Engine
+from gcar_deploy.engine import Engine, load_segmenter
 from gcar_deploy.errors import RefusedError
+from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.metrics import volume_dice
 from gcar_deploy.quality import ViewQuality
@@ -256,15 +259,26 @@ def _attempt(pair: Pair, subject: Subject, engine: Engine) -> Attempt:
 
 def _other_order(pair: Pair, engine: Engine) -> float | None:
     try:
-        views = [extract_vessels(a, engine.options.imaging) for a in pair.angiograms]
+        views = _vessels(pair, engine.options)
     except RefusedError:
         return None
-    return agreement.other_order(views, engine.options)
+    taken = agreement.agreeing(pair.angiograms, views, engine.options)[0]
+    return agreement.other_order(taken, engine.options)
+
+
+def _vessels(pair: Pair, options: RunOptions) -> list[VesselImage]:
+    network = None if pair.raw is None else _network()
+    return [extract_vessels(a, options.imaging, network) for a in pair.angiograms]
+
+
+@functools.cache
+def _network() -> Segmenter | None:
+    return load_segmenter("auto", 1)
 
 
 def _refused(pair: Pair, engine: Engine, reason: str) -> Attempt:
     try:
-        views = [extract_vessels(a, engine.options.imaging) for a in pair.angiograms]
+        views = _vessels(pair, engine.options)
     except RefusedError:
         return Attempt(disagreement=1.0, shift_mm=0.0, turn_deg=0.0, refused=reason)
     if engine.options.quality.parts_disagreement_raw < 0:

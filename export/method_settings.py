@@ -28,6 +28,7 @@ class RuntimeRow:
     centreline_loss : False turns the paper's centreline term off (alpha = 1)
     swapped : the views are given in the other order
     pose : False leaves the views where the scene puts them
+    segmenter : who finds vessels in raw pictures; None for what the runtime does unasked
     fused : False leaves the tubes round: no correction of the volume by pictures and points
     """
 
@@ -37,6 +38,7 @@ class RuntimeRow:
     swapped: bool = False
     pose: bool = True
     fused: bool = True
+    segmenter: str | None = None
 
 
 #: what the runtime does when asked for nothing in particular.
@@ -46,6 +48,8 @@ RUNTIME_ROWS: Mapping[str, RuntimeRow] = {
     "ours-swapped": RuntimeRow(swapped=True),
     "ours-nopose": RuntimeRow(pose=False),
     "ours-round": RuntimeRow(fused=False),
+    "ours-classic": RuntimeRow(segmenter="classic"),
+    "ours-net": RuntimeRow(segmenter="net"),
     "hull": RuntimeRow(predictor="none", refiner="none"),
     "hull+paper": RuntimeRow(predictor="none", refiner="paper"),
     "hull+tube": RuntimeRow(predictor="none", refiner="tube"),
@@ -74,6 +78,8 @@ DESCRIPTIONS: Mapping[str, str] = {
     "ours-swapped": "the same, views given in the other order",
     "ours-nopose": "the same without the estimate of shifts between the views",
     "ours-round": "the same with round tubes alone in the volume",
+    "ours-classic": "the same, vessels of raw pictures found without the network",
+    "ours-net": "the same, vessels of raw pictures found by the network alone",
     "hull": "hull thinned: no model, no refinement",
     "hull+paper": "hull thinned, the paper's refinement",
     "hull+tube": "hull thinned, tube refinement",
@@ -131,6 +137,9 @@ class MethodSettings:
         volume = run.refine.volume
         return dataclasses.replace(
             run,
+            imaging=dataclasses.replace(
+                run.imaging, segmenter=row.segmenter or run.imaging.segmenter
+            ),
             pose=dataclasses.replace(run.pose, enabled=run.pose.enabled and row.pose),
             predict=dataclasses.replace(
                 run.predict, predictor=row.predictor or run.predict.predictor

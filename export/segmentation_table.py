@@ -39,15 +39,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--each", action="store_true", help="one line per expert-masked picture")
-    parser.add_argument("--segmenter", choices=("classic", "net"), default="classic")
+    parser.add_argument("--segmenter", choices=("classic", "net", "auto"), default="auto")
     parser.add_argument("--model", type=Path, help="ONNX file for net; by default the shipped one")
     chosen = parser.parse_args(arguments)
     net = None if chosen.segmenter == "classic" else network(chosen.model)
+    who = chosen.segmenter
     cv2.setNumThreads(1)
     pairs = sorted(find(chosen.data, "xca_masks").glob("*_gt.png"))
     if pairs:
-        _print_expert(pairs, chosen.each, net)
-    _print_cases(find(chosen.data, "cases"), net)
+        _print_expert(pairs, chosen.each, net, who)
+    _print_cases(find(chosen.data, "cases"), net, who)
     return 0
 
 
@@ -67,22 +68,18 @@ def network(path: Path | None) -> Segmenter:
 
 
 def expert_score(
-    truth_path: Path, net: Segmenter | None = None
+    truth_path: Path, net: Segmenter | None = None, who: str = "auto"
 ) -> tuple[dict[str, float], VesselImage]:
-    """Score one expert-masked picture; ``net`` finds the vessels if given."""
+    """Score one expert-masked picture; ``who`` finds the vessels, with ``net`` where given."""
     truth = read_picture(truth_path)[0] > 127
     picture = truth_path.with_name(truth_path.name.replace("_gt", ""))
     angiogram = Angiogram.without_geometry(
         picture.stem, read_picture(picture), Intensity(kind="raw")
     )
     start = time.process_time()
-    found = extract_vessels(angiogram, _options(net), net)
+    found = extract_vessels(angiogram, ImagingOptions(segmenter=who), net)
     seconds = time.process_time() - start
     return {**mask_scores(found.mask, found.skeleton, truth), "CPU s": seconds}, found
-
-
-def _options(net: Segmenter | None) -> ImagingOptions:
-    return ImagingOptions(segmenter="classic" if net is None else "net")
 
 
 def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
@@ -100,7 +97,7 @@ def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
 
 
 def case_scores(
-    cases: Path, net: Segmenter | None = None
+    cases: Path, net: Segmenter | None = None, who: str = "auto"
 ) -> Iterator[tuple[str, dict[str, float], VesselImage, Image]]:
     """Score each view of each ``R_*`` case against the path lengths of its ``C_*`` case."""
     for raw in sorted(cases.glob("R_*")):
@@ -118,7 +115,7 @@ def case_scores(
                 intensity=intensity, sha256=sha256,
             )  # fmt: skip
             start = time.process_time()
-            found = extract_vessels(angiogram, _options(net), net)
+            found = extract_vessels(angiogram, ImagingOptions(segmenter=who), net)
             seconds = time.process_time() - start
             scores = mask_scores(found.mask, found.skeleton, truth >= TRUTH_MM)
             scores |= path_scores(found.path_mm, truth) | {"CPU s": seconds}
@@ -136,8 +133,8 @@ def path_scores(path_mm: Image, truth_mm: Image) -> dict[str, float]:
     }
 
 
-def _print_expert(pairs: Sequence[Path], each: bool, net: Segmenter | None) -> None:
-    rows = {path.name.replace("_gt.png", ""): expert_score(path, net)[0] for path in pairs}
+def _print_expert(pairs: Sequence[Path], each: bool, net: Segmenter | None, who: str) -> None:
+    rows = {path.name.replace("_gt.png", ""): expert_score(path, net, who)[0] for path in pairs}
     names = list(next(iter(rows.values())))
     print(
         f"Expert masks, {len(rows)} pictures (no geometry: field taken as {DEFAULT_FIELD_MM:g} mm)"
@@ -163,9 +160,9 @@ def _numbered(rows: dict[str, dict[str, float]], rest: int) -> dict[str, dict[st
     return {name: r for name, r in rows.items() if name.isdigit() and int(name) % 2 == rest}
 
 
-def _print_cases(cases: Path, net: Segmenter | None) -> None:
+def _print_cases(cases: Path, net: Segmenter | None, who: str) -> None:
     heading = True
-    for name, scores, _, _ in case_scores(cases, net):
+    for name, scores, _, _ in case_scores(cases, net, who):
         if heading:
             print(f"\nRaw pictures of simulated views (truth: path >= {TRUTH_MM} mm)")
             print("| view | " + " | ".join(scores) + " |")
