@@ -69,6 +69,7 @@ GATES: dict[str, tuple[float, ...]] = {
     for name, low, high, step in (
         ("good_disagreement", 0.02, 0.2, 0.005),
         ("max_disagreement", 0.04, 0.6, 0.01),
+        ("sure_disagreement_raw", 0.05, 0.4, 0.01),
         ("good_disagreement_raw", 0.05, 0.4, 0.01),
         ("max_disagreement_raw", 0.15, 1.0, 0.01),
         ("parts_disagreement_raw", 0.1, 1.0, 0.01),

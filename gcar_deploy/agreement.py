@@ -186,7 +186,7 @@ def check_agreement(
             f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
             "different patients, frames or angles?"
         )
-    if disagreement > good:
+    if disagreement > (good if calibrated else min(good, options.sure_disagreement_raw)):
         return [
             f"view {second} agrees poorly with view {first}: {disagreement:.0%} of "
             "the vessel differs along the epipolar lines"
