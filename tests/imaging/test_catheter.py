@@ -140,8 +140,10 @@ def test_turned_and_mirrored_pictures_decide_alike(scene):
                 assert _dice(back, upright.catheter) > 0.85
 
 
-def test_it_is_said_and_drawn(caplog):
-    with caplog.at_level(logging.INFO):
+def test_it_is_said_and_drawn(caplog, monkeypatch):
+    # The command line, where other tests used it, keeps the package's messages to itself.
+    monkeypatch.setattr(logging.getLogger("gcar_deploy"), "propagate", True)
+    with caplog.at_level(logging.INFO, logger="gcar_deploy"):
         found = _found((*_TREE, _CATHETERS["from above"]))
     assert f"{found.catheter_mm:.0f} mm of line taken for a catheter" in caplog.text
     steps = vessel_pictures(found)["steps.png"]
