@@ -376,7 +376,7 @@ def _open(name: str) -> RunOptions:
     gates = dataclasses.replace(
         options.quality,
         good_disagreement=2.0, max_disagreement=2.0,
-        good_disagreement_raw=2.0, max_disagreement_raw=2.0,
+        sure_disagreement_raw=2.0, good_disagreement_raw=2.0, max_disagreement_raw=2.0,
         parts_disagreement_raw=-1.0 if name == "parts" else 2.0,
         order_ratio=0.0, swapped_ratio=0.0,
         good_coverage=0.0, min_coverage=0.0, good_support=0.0, min_support=0.0,

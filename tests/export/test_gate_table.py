@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the export extra")
 
+from gcar_deploy.agreement import check_agreement, check_order
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError
@@ -164,6 +165,15 @@ def test_gates_are_chosen_where_pairs_part_and_left_where_nothing_is_gained():
     assert chosen.good_support == GATES.good_support
     easy = [row(disagreement=0.01), row("two trees", disagreement=0.9, dsc=None)]
     assert choose(easy, GATES) == GATES
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_open_gates_let_any_disagreement_pass_unsaid(calibrated):
+    """A finding of a gate in question would stay with the row whatever gate is tried later."""
+    for engine in open_engines().values():
+        gates = engine.options.quality
+        assert check_agreement(("1", "2"), 1.0, calibrated, gates) == []
+        assert check_order(("1", "2"), 1.0, 0.5, calibrated, gates) == ([], "")
 
 
 def test_a_tree_that_did_not_come_out_is_no_loss():
