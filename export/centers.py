@@ -10,19 +10,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import RunOptions
-from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.metrics import skeleton
-from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.predict.candidates import Candidates
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.decide import decide
 from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_deploy.predict.single_view import merge_views
-from gcar_deploy.reconstruct import cell_mm
-from gcar_deploy.types import Image, Points, Volume
+from gcar_deploy.reconstruct import seen_by_all
+from gcar_deploy.types import Points, Volume
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,11 +29,11 @@ class Posed:
 
     Attributes
     ----------
-    views : (C-arm, path length in mm, calibrated) per view, at the picture's own size
+    views : vessel images
     hull, encoded : what the views leave on the lattice
     """
 
-    views: list[tuple[CArm, Image, bool]]
+    views: list[VesselImage]
     hull: Candidates
     encoded: Encoded
 
@@ -44,11 +42,8 @@ def pose(angiograms: Sequence[Angiogram], grid: Grid) -> Posed:
     """Find vessels and hull as ``reconstruct`` does, without correcting poses."""
     options = RunOptions()
     views = [extract_vessels(a, options.imaging) for a in angiograms]
-    lattice = cubic_lattice(grid, cell_mm(grid, options))
-    seen = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
-    hull = visual_hull(seen, lattice, options.candidates)
-    encoded = encode(hull, [(*s, v.calibrated) for s, v in zip(seen, views, strict=True)])
-    return Posed([(v.carm, v.path_mm, v.calibrated) for v in views], hull, encoded)
+    hull, known = seen_by_all(views, grid, options)
+    return Posed(views, hull, encode(hull, known))
 
 
 def predicted(predictor: Predictor, posed: Posed) -> dict[str, Points]:
@@ -60,7 +55,7 @@ def predicted(predictor: Predictor, posed: Posed) -> dict[str, Points]:
     """
     options = RunOptions()
     if isinstance(predictor, SingleViewPredictor):
-        alone = predictor.predict([(carm, path) for carm, path, _ in posed.views])
+        alone = predictor.predict([(v.carm, v.path_mm) for v in posed.views])
         merged = merge_views(
             alone, posed.hull, posed.encoded, options.candidates, options.predict.single
         )
@@ -68,7 +63,7 @@ def predicted(predictor: Predictor, posed: Posed) -> dict[str, Points]:
             "single": merged.points_mm[merged.confidence >= 0.5],
             "single, each view": np.concatenate([view.points_mm for view in alone]),
         }
-    error = 0.0 if all(known for _, _, known in posed.views) else options.imaging.contrast_error
+    error = max(view.path_error for view in posed.views)
     found = decide(
         predictor.predict(posed.hull, posed.encoded), posed.encoded, error, options.decide
     )

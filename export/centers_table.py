@@ -157,7 +157,7 @@ def _pair(case: Case) -> Callable[[], None]:
 
 def _inference(predictor: Predictor, posed: Posed) -> Callable[[], Any]:
     if isinstance(predictor, SingleViewPredictor):
-        views = [(carm, path) for carm, path, _ in posed.views]
+        views = [(view.carm, view.path_mm) for view in posed.views]
         return lambda: predictor.predict(views)
     return lambda: predictor.predict(posed.hull, posed.encoded)
 
@@ -165,7 +165,7 @@ def _inference(predictor: Predictor, posed: Posed) -> Callable[[], Any]:
 def _feed(predictor: Predictor, posed: Posed) -> dict[str, Array]:
     """Return one inference's inputs by name; of the first view for a single-view model."""
     if isinstance(predictor, SingleViewPredictor):
-        carm, path, _ = posed.views[0]
+        carm, path = posed.views[0].carm, posed.views[0].path_mm
         picture = net_picture(carm, path, int(predictor.model.inputs["pixels"]))
         arrays = [picture.network_input(), picture.axes_input()]
         return dict(zip(predictor.input_names(), arrays, strict=False))

@@ -124,6 +124,6 @@ def _tubes(views: int, pixels: int) -> Callable[[], object]:
 def _seen(tubes: Tubes, view: CArm, number: int) -> VesselImage:
     path = footprint(tubes, view, 1.0).image((view.rows, view.columns)).astype(np.float32)
     return VesselImage(
-        view_id=str(number), carm=view, path_mm=path, calibrated=True, mask=path > 0.1,
+        view_id=str(number), carm=view, path_mm=path, path_error=0.0, mask=path > 0.1,
         skeleton=np.zeros(path.shape, bool), valid=np.ones(path.shape, bool), kind="path_length",
     )  # fmt: skip

@@ -132,8 +132,9 @@ def validate(net: MaskUNet, options: SegmenterOptions) -> float:
     """Mean Dice at 0.5 over held-out generated pictures."""
     net.eval()
     scores = []
+    stream = Stream(VALIDATION_SEED, options.validation_pictures, options.validation_pictures)
     for k in range(options.validation_pictures):
-        x, y = Stream(VALIDATION_SEED, options.validation_pictures, options.validation_pictures)[k]
+        x, y = stream[k]
         asked = y[1] > 0
         found, true = (net(x[None])[0, 0] >= 0) & asked, (y[0] >= 0.5) & asked
         both = float((found & true).sum())

@@ -23,6 +23,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
@@ -151,14 +152,13 @@ class Engine:
         started = time.perf_counter()
         angiograms, grid, notes = prepare(views, geometry, self.options)
         angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
-        grey = any(a.intensity.kind != "path_length" and a.mask is None for a in angiograms)
         notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
         result = reconstruct(
             angiograms,
             grid,
             self.options,
             predictor=self._predictor,
-            segmenter=self._needed_segmenter() if grey else None,
+            segmenter=self._needed_segmenter() if asks_network(angiograms) else None,
             on_progress=on_progress,
             deadline_s=deadline_s,
             cancel=cancel,

@@ -19,7 +19,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.extract import asks_network, extract_vessels
 from gcar_deploy.quality import check_views
 
 
@@ -93,8 +93,8 @@ def inspect_files(
             )
         found.silent += silent_errors(carms)
         found.warnings += check_views(angiograms, options.quality)
-        grey = any(a.intensity.kind != "path_length" and a.mask is None for a in angiograms)
-        views, segmenter = [], load_segmenter(options.imaging.segmenter) if grey else None
+        wanted = options.imaging.segmenter if asks_network(angiograms) else "classic"
+        views, segmenter = [], load_segmenter(wanted)
         for entry, angiogram in zip(found.views, angiograms, strict=True):
             view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())

@@ -115,7 +115,7 @@ def reconstruct(
             )
         views = [posed(view, pose) for view, pose in zip(views, poses, strict=True)]
     with watch.stage("candidates"):
-        hull, known = _hull(views, grid, options)
+        hull, known = seen_by_all(views, grid, options)
         with with_hint(hint):
             quality.check_candidates(len(hull), hull.lattice, options.quality)
         watch.check()
@@ -177,7 +177,7 @@ def cell_mm(grid: Grid, options: RunOptions) -> float:
     return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
 
 
-def _hull(
+def seen_by_all(
     views: Sequence[VesselImage], grid: Grid, options: RunOptions
 ) -> tuple[Candidates, list[tuple[CArm, Image, bool]]]:
     """Points that all views see as vessel; per view its C-arm, sampled path and calibration."""
@@ -243,7 +243,7 @@ def _bundled(
     """Poses of three and more views from their tree, and what the profiles say of them."""
 
     def tree_of(placed: Sequence[VesselImage]) -> Tree:
-        hull, known = _hull(placed, grid, options)
+        hull, known = seen_by_all(placed, grid, options)
         watch.check()
         if len(hull) == 0:
             return empty_tree()

@@ -55,7 +55,7 @@ def pair(seeds=(4, 4), stranger=False, calibrated=False):
 def _view(carm, path, calibrated):
     mask = path > 0
     return VesselImage(
-        view_id="1", carm=carm, path_mm=path, calibrated=calibrated, mask=mask,
+        view_id="1", carm=carm, path_mm=path, path_error=0.0 if calibrated else 0.25, mask=mask,
         skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="raw",
     )  # fmt: skip
 

@@ -34,8 +34,7 @@ class QualityOptions:
     #: 0.19 in nine of ten pairs of one tree (real trees: 0.12), 0.13 and more where two trees or a
     #: wrong sign contradict each other (real: 0.149). So above the first figure the finished tree
     #: decides: it leaves more than a tenth of a view's vessels unexplained in 91 of 103
-    #: contradictory pairs. 0.18 is cheapest on the trees to choose on (0.33; at 0.15 0.37), a bit
-    #: dearer on the others (0.46; at 0.15 0.44)
+    #: contradictory pairs. Chosen on the first trees
     good_disagreement_raw: Gate = 0.18
     max_disagreement_raw: Gate = 0.6
     #: above this raw pictures are never ``ok``: two real trees were at 0.149. From 0.12 on it takes
@@ -61,8 +60,7 @@ class QualityOptions:
     min_coverage: Share = 0.3
     #: share of the reprojected tree that lies on the view's vessels: 0.94 and more in pairs of
     #: path lengths of one tree, but 0.6 and more in raw ones, whose masks are what two methods
-    #: agree on. 0.9 is cheaper than 0.95 on both seeds (0.33 for 0.39, 0.46 for 0.53), and 0.85
-    #: would make the first contradictory pair ``ok``
+    #: agree on. Chosen on the first trees, at the strict end of what is cheap there
     good_support: Share = 0.9
     min_support: Share = 0.3
     #: how near counts, pixels of the picture, but at least so many mm at the isocentre: half a

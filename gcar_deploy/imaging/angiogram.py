@@ -102,10 +102,9 @@ class VesselImage:
     path_mm : (rows, cols) float32
         Millimetres of vessel along the ray of each pixel (mean over the pixel), 0 away from
         vessels. An estimate unless ``calibrated``.
-    calibrated : bool
-        True only for ``path_length`` pictures, whose scale was given.
     path_error : float
-        Relative standard deviation of a path; 0 where calibrated.
+        Relative standard deviation of a path; 0 only for ``path_length`` pictures, whose scale
+        was given: these are ``calibrated``.
     alone : VesselImage or None
         What the network alone sees, where this is a fusion of it with another method.
     mask, skeleton, valid : (rows, cols) bool
@@ -124,7 +123,7 @@ class VesselImage:
     view_id: str
     carm: CArm
     path_mm: Image
-    calibrated: bool
+    path_error: float
     mask: Mask
     skeleton: Mask
     valid: Mask
@@ -132,13 +131,17 @@ class VesselImage:
     vesselness: Image | None = None
     catheter: Mask | None = None
     catheter_mm: float = 0.0
-    path_error: float = 0.0
     alone: VesselImage | None = None
 
     def __post_init__(self) -> None:
         for array in (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter):
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether paths are true millimetres."""
+        return self.path_error == 0
 
 
 def _check_shape(view_id: str, carm: CArm, array: Image | Mask) -> None:

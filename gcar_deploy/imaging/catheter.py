@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.config import CatheterOptions
+from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
 from gcar_deploy.types import Image, Mask, Scalars
@@ -119,7 +120,8 @@ def line_widths(line: Mask, flat: Image, sigma_px: Image, pixel_mm: float) -> Im
     have a step along the vessel.
     """
     rows, columns = np.nonzero(line)
-    angle = _normals(flat, max(1.0, 0.75 / pixel_mm))[rows, columns, None]
+    normal = enhance.curvature(flat, max(1.0, 0.75 / pixel_mm))[2]
+    angle = normal[rows, columns, None]
     offset = np.arange(0, _PROFILE_MM / pixel_mm, _OFFSET_STEP, dtype=np.float32)
     smooth = cv2.GaussianBlur(flat, (0, 0), 0.8)
     sides = [
@@ -141,15 +143,6 @@ def line_widths(line: Mask, flat: Image, sigma_px: Image, pixel_mm: float) -> Im
         first = np.where(below.any(axis=1), below.argmax(axis=1), len(offset) - 1)
         width[rows, columns] += offset[first] * np.float32(pixel_mm)
     return skel.spread(line, (width,), max(1.0, 1.0 / pixel_mm))[1][0]
-
-
-def _normals(picture: Image, sigma_px: float) -> Image:
-    """(rows, cols) angle of the steepest curvature's direction against the columns' axis."""
-    smooth = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
-    xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3)
-    yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3)
-    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3)
-    return np.asarray(0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2, dtype=np.float32)
 
 
 def _cut(

@@ -127,6 +127,28 @@ def _blurred_pair(picture: Image, weight: Image, sigma_px: float) -> tuple[Image
     return _wide_blur(picture * weight, sigma_px), _wide_blur(weight, sigma_px)
 
 
+def curvature(picture: Image, sigma_px: float) -> tuple[Image, Image, Image]:
+    """Strongest negative curvature of a blurred picture.
+
+    Returns
+    -------
+    smooth : (rows, cols) float32, blurred by a Gaussian of ``sigma_px``
+    strongest : (rows, cols) float32, smaller eigenvalue of its Hessian, units per pixel^2
+    normal : (rows, cols) float32, direction of that eigenvector, radians from the columns' axis
+    """
+    smooth = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
+    xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3, scale=0.25)
+    yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3, scale=0.25)
+    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
+    half_gap = np.hypot(0.5 * (xx - yy), xy)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.float32(np.pi / 2)
+    return (
+        np.asarray(smooth, dtype=np.float32),
+        np.asarray(0.5 * (xx + yy) - half_gap, dtype=np.float32),
+        np.asarray(angle, dtype=np.float32),
+    )
+
+
 def ridge_response(picture: Image, sigma_px: float, gap_sigmas: float) -> Image:
     """Response of one scale to bright lines.
 
@@ -145,14 +167,7 @@ def ridge_response(picture: Image, sigma_px: float, gap_sigmas: float) -> Image:
     -------
     (rows, cols) float32, units of the picture, >= 0
     """
-    smooth = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
-    xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3, scale=0.25)
-    yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3, scale=0.25)
-    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
-    half_gap = np.hypot(0.5 * (xx - yy), xy)
-    strongest = 0.5 * (xx + yy) - half_gap
-    # The normal is the eigenvector of the smaller eigenvalue.
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.float32(np.pi / 2)
+    smooth, strongest, angle = curvature(picture, sigma_px)
     step = np.float32(gap_sigmas * sigma_px)
     dx, dy = step * np.cos(angle), step * np.sin(angle)
     row, column = np.indices(picture.shape, dtype=np.float32)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
+#: what ``bright_vessels`` gives
+_Grey: TypeAlias = tuple[dict[str, Image], Mask]
 #: polarity is taken from the picture only when one sign answers this much more strongly
 _POLARITY_MARGIN = 1.15
 
@@ -52,25 +56,31 @@ def extract_vessels(
         raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")
     if angiogram.intensity.kind == "path_length":
         return _from_path_length(angiogram, options)
-    if angiogram.mask is not None or options.segmenter == "classic":
-        return _from_grey(angiogram, options, None)
+    if options.segmenter == "net" and angiogram.mask is None:
+        segmenter = _needed(segmenter)
+    grey = _grey_values(angiogram, options)
+    if segmenter is None or options.segmenter == "classic" or angiogram.mask is not None:
+        return _from_grey(angiogram, grey, options, None)
     if options.segmenter == "net":
-        return _from_grey(angiogram, options, _needed(segmenter))
-    return _from_both(angiogram, options, segmenter)
+        return _from_grey(angiogram, grey, options, segmenter)
+    return _from_both(angiogram, grey, options, segmenter)
+
+
+def asks_network(angiograms: Sequence[Angiogram]) -> bool:
+    """Whether vessels have to be found in any of these: no path lengths, and no mask given."""
+    return any(a.intensity.kind != "path_length" and a.mask is None for a in angiograms)
 
 
 def _from_both(
-    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
+    angiogram: Angiogram, grey: _Grey, options: ImagingOptions, segmenter: Segmenter
 ) -> VesselImage:
     """Fuse both methods; where one finds no vessel, the other has the say."""
-    if segmenter is None:
-        return _from_grey(angiogram, options, None)
     try:
-        learned = _from_grey(angiogram, options, segmenter)
+        learned = _from_grey(angiogram, grey, options, segmenter)
     except RefusedError:
-        return _from_grey(angiogram, options, None)
+        return _from_grey(angiogram, grey, options, None)
     try:
-        return fused(_from_grey(angiogram, options, None), learned)
+        return fused(_from_grey(angiogram, grey, options, None), learned)
     except RefusedError:
         return learned
 
@@ -114,7 +124,7 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
         view_id=angiogram.view_id,
         carm=angiogram.carm,
         path_mm=np.where(mask, path, np.float32(0)),
-        calibrated=True,
+        path_error=0.0,
         mask=mask,
         skeleton=skel.skeletonize(mask),
         valid=valid,
@@ -122,15 +132,18 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
     )
 
 
-def _from_grey(
-    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
-) -> VesselImage:
-    pixels, kind = angiogram.pixels, angiogram.intensity.kind
-    pixel_mm = angiogram.carm.pixel_at_isocenter_mm
+def _grey_values(angiogram: Angiogram, options: ImagingOptions) -> _Grey:
+    """Pictures with bright vessels, and where there is no picture; see ``bright_vessels``."""
     dark = is_dark(angiogram, options)
-    pictures, holes = bright_vessels(pixels, kind, dark, options)
-    if angiogram.valid is not None:
-        holes = holes | ~angiogram.valid
+    pictures, holes = bright_vessels(angiogram.pixels, angiogram.intensity.kind, dark, options)
+    return pictures, holes if angiogram.valid is None else holes | ~angiogram.valid
+
+
+def _from_grey(
+    angiogram: Angiogram, grey: _Grey, options: ImagingOptions, segmenter: Segmenter | None
+) -> VesselImage:
+    pixel_mm = angiogram.carm.pixel_at_isocenter_mm
+    pictures, holes = grey
     search = pictures.get("search", next(iter(pictures.values())))
     path_mm, path_error = None, options.chord_error
     if angiogram.mask is not None:
@@ -162,13 +175,12 @@ def _from_grey(
         view_id=angiogram.view_id,
         carm=angiogram.carm,
         path_mm=path_mm,
-        calibrated=False,
+        path_error=path_error,
         mask=found.mask,
         skeleton=found.skeleton,
         valid=found.valid,
-        kind=kind,
+        kind=angiogram.intensity.kind,
         vesselness=found.vesselness,
-        path_error=path_error,
         catheter=found.catheter if angiogram.mask is None else None,
         catheter_mm=found.catheter_mm,
     )

@@ -9,7 +9,6 @@ import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.imaging.learned import nearest
 from gcar_deploy.types import Mask
 
 
@@ -47,7 +46,7 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
 def _drawn(classic: VesselImage, learned: VesselImage) -> Mask:
     """Classical rims along the lines that the network follows too; its own where there are none."""
     near = cv2.dilate((learned.path_mm > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    followed = nearest(classic.mask, classic.skeleton, classic.skeleton & near)
+    followed = skel.beside(classic.mask, classic.skeleton, classic.skeleton & near)
     return followed if followed.any() else learned.mask
 
 

@@ -99,26 +99,13 @@ def support(
     reach = skel.parts_touching(probability >= levels[0], probability >= levels[1])
     line = whole = skel.skeletonize(reach)
     if not line.any():
-        return reach & False
+        return np.zeros_like(reach)
     deep = np.asarray(cv2.GaussianBlur(chord, (0, 0), 0.7), dtype=np.float32)
     top = float(np.percentile(deep[line], 90))
     line = skel.prune(line, deep, options.spur_mm / pixel_mm, options.net_twig_share * top)
     if line.any():
         line = skel.strong_parts(line, deep, options.part_share)
-    return nearest(reach, whole, line)
-
-
-def nearest(reach: Mask, whole: Mask, kept: Mask) -> Mask:
-    """Pixels of ``reach`` whose nearest pixel of the line ``whole`` is, or touches, a kept one."""
-    if not kept.any():
-        return np.zeros_like(reach)
-    near = cv2.dilate(kept.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    _, label = cv2.distanceTransformWithLabels(
-        (~whole).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    table = np.zeros(int(label.max()) + 1, bool)
-    table[label[whole]] = near[whole]
-    return reach & table[label]
+    return skel.beside(reach, whole, line)
 
 
 def _without_catheters(
@@ -133,7 +120,7 @@ def _without_catheters(
         taken = catheters(line, flat, width, ~holes, pixel_mm, options.catheter)
     if not taken.any():
         return reach, taken
-    kept = nearest(reach, line, line & ~taken)
+    kept = skel.beside(reach, line, line & ~taken)
     return kept, reach & ~kept
 
 

@@ -96,15 +96,33 @@ def spread(
     carried : tuple of (rows, cols) float32
         Each value at that skeleton pixel, after a Gaussian average along the line.
     """
-    distance, label = cv2.distanceTransformWithLabels(
-        (~skeleton).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    distance, label = _to_line(skeleton)
     weight = cv2.GaussianBlur(skeleton.astype(np.float32), (0, 0), smooth_px)
     carried = []
     for value in values:
         on_line = np.where(skeleton, value, 0).astype(np.float32)
         mean = cv2.GaussianBlur(on_line, (0, 0), smooth_px) / np.maximum(weight, 1e-9)
-        table = np.zeros(int(label.max()) + 1, np.float32)
-        table[label[skeleton]] = mean[skeleton]
-        carried.append(table[label])
+        carried.append(_carried(np.asarray(mean, dtype=np.float32), skeleton, label))
     return np.asarray(distance, dtype=np.float32), tuple(carried)
+
+
+def beside(reach: Mask, skeleton: Mask, kept: Mask) -> Mask:
+    """Pixels of ``reach`` whose nearest skeleton pixel is, or touches, one of ``kept``."""
+    if not kept.any():
+        return np.zeros_like(reach)
+    near = cv2.dilate(kept.astype(np.uint8), _BLOCK) > 0
+    return reach & _carried(near, skeleton, _to_line(skeleton)[1])
+
+
+def _to_line(skeleton: Mask) -> tuple[Array, Array]:
+    """(rows, cols) each: distance to the nearest skeleton pixel, and that pixel's number."""
+    return cv2.distanceTransformWithLabels(
+        (~skeleton).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+
+
+def _carried(values: Array, skeleton: Mask, label: Array) -> Array:
+    """(rows, cols) value at the nearest skeleton pixel; ``label`` as ``_to_line`` numbers them."""
+    table = np.zeros(int(label.max()) + 1, values.dtype)
+    table[label[skeleton]] = values[skeleton]
+    return table[label]

@@ -31,8 +31,7 @@ class Target:
     sigma_mm : (rows, cols) noise of a mm^2 of picture
     box_px : float, width of the averaging box in the model, pixels
     pixel_mm : float, pixel edge at the isocentre
-    calibrated : bool
-    path_error : float, relative, of paths that are not calibrated
+    path_error : float, relative; 0 of calibrated pictures
     contrast : float, factor on the model, 1 for calibrated pictures
     empty_cost : float, sum over pixels of weight log(1 + (path / (c sigma))^2), the robust
         cost of an empty model
@@ -44,10 +43,14 @@ class Target:
     sigma_mm: Array
     box_px: float
     pixel_mm: float
-    calibrated: bool = True
     path_error: float = 0.0
     contrast: float = 1.0
     empty_cost: float = 0.0
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether paths are true millimetres."""
+        return self.path_error == 0
 
     def with_contrast(self, model: Array) -> Target:
         """Fit the contrast factor to a model picture by least squares (variable projection)."""
@@ -106,7 +109,6 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
         sigma_mm=sigma,
         box_px=max(float(np.sqrt(12 * variance)), 0.05),
         pixel_mm=carm.pixel_at_isocenter_mm,
-        calibrated=view.calibrated,
         path_error=view.path_error,
         empty_cost=float((np.log1p(z * z) * weight[some]).sum()),
     )

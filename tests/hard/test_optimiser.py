@@ -213,9 +213,9 @@ def test_thousands_of_duplicates_over_50_steps(small):
 
 def test_pictures_of_unknown_scale_find_their_contrast(views):
     truth = random_gaussians(20, 5, spread=20, sigma=(1.5, 2.5))
-    scaled = [dataclasses.replace(v, path_mm=1.6 * v.path_mm, calibrated=False) for v in views]
+    scaled = [dataclasses.replace(v, path_mm=1.6 * v.path_mm, path_error=0.25) for v in views]
     out = refine_paper(truth, scaled, dataclasses.replace(OPTIONS, steps=3, control_every=0))
     np.testing.assert_allclose(out.contrast, 1.6, rtol=0.02)
     # Beyond its bounds the factor stays on them.
-    bright = [dataclasses.replace(v, path_mm=99 * v.path_mm, calibrated=False) for v in views]
+    bright = [dataclasses.replace(v, path_mm=99 * v.path_mm, path_error=0.25) for v in views]
     assert refine_paper(truth, bright, OPTIONS).contrast == (2.5, 2.5)

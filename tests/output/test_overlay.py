@@ -28,7 +28,7 @@ def blank_view(rows=128, columns=96):
     )  # fmt: skip
     nothing = np.zeros((rows, columns), bool)
     return VesselImage(
-        view_id="1", carm=carm, path_mm=np.zeros((rows, columns), np.float32), calibrated=True,
+        view_id="1", carm=carm, path_mm=np.zeros((rows, columns), np.float32), path_error=0.0,
         mask=nothing, skeleton=nothing, valid=~nothing, kind="path_length",
     )  # fmt: skip
 

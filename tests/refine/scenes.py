@@ -24,7 +24,6 @@ def vessel_image(view, path, calibrated=True, name="1"):
         view_id=name,
         carm=view,
         path_mm=path,
-        calibrated=calibrated,
         path_error=0.0 if calibrated else 0.25,
         mask=path > 0.1,
         skeleton=np.zeros(path.shape, bool),

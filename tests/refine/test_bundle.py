@@ -43,7 +43,7 @@ def scene(count, seed):
         mask = path > 0.1
         views.append(
             VesselImage(
-                view_id="1", carm=told, path_mm=path, calibrated=False, mask=mask, path_error=0.25,
+                view_id="1", carm=told, path_mm=path, path_error=0.25, mask=mask,
                 skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="raw",
             )
         )  # fmt: skip
@@ -159,7 +159,7 @@ def test_rounds_of_tree_and_poses():
         raise AssertionError("a tree is made for nothing")
 
     assert bundled(views[:2], first[:2], never, RunOptions()) == first[:2]
-    exact = [dataclasses.replace(view, calibrated=True) for view in views]
+    exact = [dataclasses.replace(view, path_error=0.0) for view in views]
     assert bundled(exact, first, never, RunOptions()) == first
     still = (Pose(),) * 4
     assert bundled(views, still, never, RunOptions()) == still
