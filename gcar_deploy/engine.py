@@ -27,15 +27,15 @@ from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
-from gcar_deploy.output.result import Result
-from gcar_deploy.predict.center_predictor import Predictor, open_predictor
-from gcar_deploy.predict.golden import check_golden
-from gcar_deploy.predict.model_spec import (
+from gcar_deploy.models.golden import check_golden
+from gcar_deploy.models.spec import (
     SEGMENTER_MODEL,
     SHIPPED,
     read_model,
     shipped_model_path,
 )
+from gcar_deploy.output.result import Result
+from gcar_deploy.predict.center_predictor import Predictor, open_predictor
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
 

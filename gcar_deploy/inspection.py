@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.agreement import agreeing, check_consistency, order_of, with_hint
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.engine import load_segmenter, prepare
 from gcar_deploy.errors import GcarError
@@ -20,7 +19,8 @@ from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asks_network, extract_vessels
-from gcar_deploy.quality import check_views
+from gcar_deploy.pose.agreement import agreeing, check_consistency, order_of, with_hint
+from gcar_deploy.quality.gates import check_views
 
 
 @dataclasses.dataclass(kw_only=True)

@@ -12,15 +12,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy import alternatives, quality
-from gcar_deploy.agreement import (
-    agreeing,
-    check_consistency,
-    order_of,
-    poses_between,
-    with_hint,
-)
-from gcar_deploy.bundling import bundled, posed
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import CancelledError, NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -31,20 +22,30 @@ from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.candidates import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.pose.agreement import (
+    agreeing,
+    check_consistency,
+    order_of,
+    poses_between,
+    with_hint,
+)
+from gcar_deploy.pose.bundling import bundled, posed
+from gcar_deploy.pose.landmarks import landmark_pixels
+from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
-from gcar_deploy.predict.decide import decide
+from gcar_deploy.predict.decision import decide
 from gcar_deploy.predict.encoding import Encoded, encode
-from gcar_deploy.predict.looks import mean_evidence, near_evidence, shifted_lattice
+from gcar_deploy.predict.hull import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.predict.lattices import mean_evidence, near_evidence, shifted_lattice
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
-from gcar_deploy.refine.landmarks import landmark_pixels
-from gcar_deploy.refine.pose import Pose
-from gcar_deploy.refine.refine import Refined, refine, refined_volume
-from gcar_deploy.refine.tube_model import footprint, tubes_of
+from gcar_deploy.quality import alternatives
+from gcar_deploy.quality import gates as quality
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree, empty_tree
+from gcar_deploy.tubes.model import footprint, tubes_of
+from gcar_deploy.tubes.refine import Refined, refine, refined_volume
 from gcar_deploy.types import Image, Mask
 
 #: stages with their usual share of the time

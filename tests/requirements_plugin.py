@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from tools.requirements import TABLE, read_table
+from tests.requirements import TABLE, read_table
 
 _KEY = "req"
 

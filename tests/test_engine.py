@@ -69,7 +69,7 @@ def test_eight_threads_share_the_shipped_model_to_the_byte(case, request):
 
 def test_an_existing_session_is_used_as_it_is(case):
     ort = pytest.importorskip("onnxruntime")
-    from gcar_deploy.predict.model_spec import shipped_model_path
+    from gcar_deploy.models.spec import shipped_model_path
 
     angiograms, grid, _ = case
     ran = []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.requirements import TABLE, TESTS, marks, problems, read_table, written
+from tests.requirements import TABLE, TESTS, marks, problems, read_table, written
 
 pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[1]
@@ -29,7 +29,7 @@ def test_skipped(): pytest.skip("no data")
 
 
 def test_table_and_marks_agree():
-    assert problems() == [], "python -m tools.requirements --write"
+    assert problems() == [], "python -m tests.requirements --write"
     assert len(read_table(TABLE)) >= 40
 
 

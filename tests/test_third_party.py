@@ -14,18 +14,20 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.req("REQ-47")
 def test_every_direct_dependency_is_listed_with_its_licence():
     """By name: versions move on, and a fresh installation may have newer ones."""
-    from tools.sbom import direct
+    from gcar_export.shipping.sbom import direct
 
     text = (ROOT / "THIRD_PARTY.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| ([\w.-]+) \| [^|]+ \| ([^|]+) \|", text, flags=re.MULTILINE))
     for name in direct():
-        assert rows.get(name, "").strip(), f"{name}: python -m tools.sbom --third-party"
+        assert rows.get(name, "").strip(), (
+            f"{name}: python -m gcar_export.shipping.sbom --third-party"
+        )
 
 
 @pytest.mark.req("REQ-47")
 def test_bill_of_materials_is_valid():
     pytest.importorskip("cyclonedx", reason="needs cyclonedx-python-lib")
-    from tools.sbom import as_json, bill, direct
+    from gcar_export.shipping.sbom import as_json, bill, direct
 
     runtime = [name for name, parts in direct().items() if "runtime" in parts]
     found = json.loads(as_json(bill(runtime)))

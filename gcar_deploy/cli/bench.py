@@ -73,7 +73,7 @@ def bench(
             raise UsageError(f"{path} exists; --force replaces it")
     if out_dir.exists() and not out_dir.is_dir():
         raise UsageError(f"{out_dir} is not a folder")
-    from gcar_deploy import benchmark
+    from gcar_deploy.bench import tradeoff as benchmark
 
     cases = [benchmark.demo(), *(benchmark.label_cases(data) if data else [])]
     grid = benchmark.cells(quick)
@@ -91,7 +91,7 @@ def bench(
 
 
 def _stages(repeats: int, threads: int | None, quiet: bool) -> str:
-    from gcar_deploy.stages import stage_seconds, table
+    from gcar_deploy.bench.stages import stage_seconds, table
 
     with ProgressBar(quiet=quiet) as bar:
         cold, warm = stage_seconds(repeats, threads, lambda share: bar("stages", share))
@@ -100,8 +100,8 @@ def _stages(repeats: int, threads: int | None, quiet: bool) -> str:
 
 def chart(rows: list[Any], name: str) -> str:
     """Return the rows of one case as an SVG document."""
-    from gcar_deploy.benchmark import front, knee
-    from gcar_deploy.output.tradeoff import Point, tradeoff_svg
+    from gcar_deploy.bench.chart import Point, tradeoff_svg
+    from gcar_deploy.bench.tradeoff import front, knee
 
     def point(row: Any) -> Point:
         return Point(
@@ -146,7 +146,7 @@ def _csv(rows: list[Any]) -> str:
 
 
 def _lines(rows: list[Any], paired: bool) -> list[str]:
-    from gcar_deploy.benchmark import front, knee
+    from gcar_deploy.bench.tradeoff import front, knee
 
     best = front(rows)
     if not best:

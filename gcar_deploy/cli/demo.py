@@ -64,7 +64,7 @@ def demo(
     check_target(out_dir, force=force)
     from gcar_deploy.data.demo_case import demo_case
     from gcar_deploy.engine import Engine
-    from gcar_deploy.metrics import volume_measures
+    from gcar_deploy.measure.metrics import volume_measures
 
     case = demo_case()
     engine = Engine(

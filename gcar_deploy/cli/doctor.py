@@ -78,8 +78,8 @@ def processor() -> dict[str, Any]:
 def model() -> dict[str, Any]:
     """Name and hash of the shipped model, or why there is none."""
     from gcar_deploy.errors import ModelError
+    from gcar_deploy.models.spec import read_model, shipped_model_path
     from gcar_deploy.predict.center_predictor import open_predictor
-    from gcar_deploy.predict.model_spec import read_model, shipped_model_path
 
     path = shipped_model_path()
     if path is None:

@@ -27,7 +27,7 @@ def info(path: Path, as_json: bool) -> None:
 
     if path.suffix == ".onnx":
         from gcar_deploy.cli.model_card import card
-        from gcar_deploy.predict.model_spec import read_model
+        from gcar_deploy.models.spec import read_model
 
         model = read_model(path)
         click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))

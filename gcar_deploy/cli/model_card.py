@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gcar_deploy.predict.model_spec import ModelFile
+    from gcar_deploy.models.spec import ModelFile
 
 
 def card(model: ModelFile) -> list[str]:

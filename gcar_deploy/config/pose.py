@@ -51,7 +51,7 @@ class PoseOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BundleOptions:
-    """Offsets of three and more views from the tree they show (see ``refine/bundle.py``)."""
+    """Offsets of three and more views from the tree they show (``pose/bundle_adjustment.py``)."""
 
     #: a tree and its views' poses are fitted to each other at most so often
     rounds: Annotated[int, Range(0, 100)] = 2

@@ -42,7 +42,7 @@ class CandidateOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DecideOptions:
-    """From confidences to a decision (see ``predict/decide.py``)."""
+    """From confidences to a decision (see ``predict/decision.py``)."""
 
     steps: Annotated[int, Range(1, 10000)] = 24
     #: inverse temperature reached at the last step

@@ -14,9 +14,9 @@ from typing import Any
 import cv2
 
 from gcar_deploy.errors import GcarError
+from gcar_deploy.measure.lumen import foreshortening
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.result import Result
-from gcar_deploy.tree.lumen import foreshortening
 from gcar_deploy.types import Array
 
 _TEMPLATE = "report_template.html"

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.measure.lumen import branch_lumen, reference_stretch
 from gcar_deploy.output.overlay import branch_color
 from gcar_deploy.output.result import Result
-from gcar_deploy.tree.lumen import branch_lumen, reference_stretch
 from gcar_deploy.tree.tree import Branch
 from gcar_deploy.types import Array, Points, Scalars
 

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.tree.lumen import branch_lumens
-from gcar_deploy.tree.naming import BranchName
+from gcar_deploy.measure.lumen import branch_lumens
+from gcar_deploy.measure.naming import BranchName
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 

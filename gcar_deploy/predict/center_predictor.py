@@ -13,11 +13,11 @@ import onnxruntime as ort
 from gcar_deploy.errors import CancelledError, ModelError, NumericalError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.predict.candidates import Candidates
+from gcar_deploy.models.golden import check_golden
+from gcar_deploy.models.spec import ModelFile
 from gcar_deploy.predict.center_map import OUTPUTS, ViewCenters, decode, net_picture
 from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
-from gcar_deploy.predict.golden import check_golden
-from gcar_deploy.predict.model_spec import ModelFile
+from gcar_deploy.predict.hull import Candidates
 from gcar_deploy.types import Array, Image
 
 #: how often a running inference is asked whether it should end, seconds

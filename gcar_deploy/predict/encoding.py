@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.predict.candidates import Candidates, bilinear_of
+from gcar_deploy.predict.hull import Candidates, bilinear_of
 from gcar_deploy.types import Array, Image
 
 #: number of per-view features that ``encode`` makes; part of the model's spec

@@ -21,9 +21,9 @@ from scipy import ndimage
 
 from gcar_deploy.config import CandidateOptions, SingleViewOptions
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.predict.candidates import Candidates
 from gcar_deploy.predict.center_map import ViewCenters
 from gcar_deploy.predict.encoding import Encoded
+from gcar_deploy.predict.hull import Candidates
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.types import Points, Scalars
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from gcar_deploy.config import CandidateOptions
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.predict.candidates import Candidates
 from gcar_deploy.predict.encoding import Encoded
+from gcar_deploy.predict.hull import Candidates
 from gcar_deploy.types import Array, Scalars
 
 

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
 import os, signal, sys, time
-from tools.battery.pool import FoundError, Limits, run_cases
+from tests.battery.pool import FoundError, Limits, run_cases
 def case(index, folder):
     if index == 1: os.kill(os.getpid(), signal.SIGSEGV)
     if index == 2:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="forks and POSIX limi
 
 def battery(*arguments: object) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "tools.battery", *(str(a) for a in arguments)],
+        [sys.executable, "-m", "tests.battery", *(str(a) for a in arguments)],
         capture_output=True, text=True, cwd=ROOT, timeout=900, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
@@ -82,7 +82,7 @@ def test_same_input_same_bytes():
 def test_threads_and_files_stay_in_a_warm_process():
     """A short line says nothing of the memory's slope; the rest of it holds at once."""
     done = subprocess.run(
-        [sys.executable, "-m", "tools.battery", "soak", "--count", "40"],
+        [sys.executable, "-m", "tests.battery", "soak", "--count", "40"],
         capture_output=True, text=True, cwd=ROOT, timeout=900, check=False,
     )  # fmt: skip
     findings = [line for line in done.stdout.splitlines() if line.startswith("    ")]
@@ -91,7 +91,7 @@ def test_threads_and_files_stay_in_a_warm_process():
 
 
 def test_every_bug_of_the_mutation_check_can_still_be_put_in():
-    from tools.battery.mutants import MUTANTS
+    from tests.battery.mutants import MUTANTS
 
     assert len(MUTANTS) >= 10
     assert {m.name.split(":")[0] for m in MUTANTS} >= {

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.selftest import tiny_case
-from tools.battery.cases import geometry
+from tests.battery.cases import geometry
 
 
 @dataclasses.dataclass(frozen=True)

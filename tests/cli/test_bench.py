@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from gcar_deploy import benchmark
-from gcar_deploy.benchmark import Cell, Row, at_size, front, knee
+from gcar_deploy.bench import tradeoff as benchmark
+from gcar_deploy.bench.tradeoff import Cell, Row, at_size, front, knee
 from gcar_deploy.cli.bench import COLUMNS, _csv, chart
 from tests.cli.conftest import gcar
 
@@ -90,8 +90,8 @@ def test_what_the_workshop_offers_is_declared_and_there():
     declared = tomllib.loads((root / "pyproject.toml").read_text())["project"]["entry-points"]
     assert set(declared[benchmark.PLUGINS]) == {"label-cases", "pair-timer"}
     pytest.importorskip("numba")
-    from gcar_export import bench_plugins
+    from gcar_export.cli import bench_plugins
 
     for target in declared[benchmark.PLUGINS].values():
         module, name = target.split(":")
-        assert module == "gcar_export.bench_plugins" and callable(getattr(bench_plugins, name))
+        assert module == "gcar_export.cli.bench_plugins" and callable(getattr(bench_plugins, name))

@@ -13,7 +13,7 @@ import pytest
 
 from gcar_deploy.cli import main as entry
 from gcar_deploy.cli.main import VERBS
-from gcar_deploy.predict.model_spec import SHIPPED, shipped_model_path
+from gcar_deploy.models.spec import SHIPPED, shipped_model_path
 from tests.cli.conftest import gcar
 
 

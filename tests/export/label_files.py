@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from gcar_deploy.geometry.grid import Grid
-from gcar_export.render import occupancy
-from gcar_export.trees import random_tree
+from gcar_export.scenes.render import occupancy
+from gcar_export.scenes.trees import random_tree
 
 #: trees are shrunk to this share, so that they are quickly done.
 SHRUNK = 0.6

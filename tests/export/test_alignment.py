@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("torch", reason="needs the export extra")
 
 from gcar_deploy.tree.surface import lumen_surface, stl_bytes
-from gcar_export.alignment import align, best_rotation, read_stl, sample_surface
+from gcar_export.evaluate.alignment import align, best_rotation, read_stl, sample_surface
 from tests.tree.shapes import fork, tube
 
 

@@ -5,10 +5,10 @@ import pytest
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.metrics import best_dice
-from gcar_export.baselines.visual_hull import visual_hull
-from gcar_export.labels import LabelVolume
-from gcar_export.raycast import raycast
+from gcar_deploy.measure.metrics import best_dice
+from gcar_export.methods.visual_hull import visual_hull
+from gcar_export.scenes.labels import LabelVolume
+from gcar_export.scenes.raycast import raycast
 
 GRID = Grid(center_mm=(0, 0, 0), size_mm=(64, 64, 64), shape=(64, 64, 64))
 
@@ -52,7 +52,7 @@ def test_visual_hull_contains_the_tree_and_shrinks_with_views(tree):
 
 def test_rtk_projects_as_the_ray_caster_does(tree):
     pytest.importorskip("itk")
-    from gcar_export.rtk_geometry import forward
+    from gcar_export.methods.rtk_geometry import forward
 
     carms = [
         carm(-30, -20),
@@ -67,7 +67,7 @@ def test_rtk_projects_as_the_ray_caster_does(tree):
 
 def test_volume_passes_through_rtk_unchanged(tree):
     pytest.importorskip("itk")
-    from gcar_export.rtk_geometry import volume_array, volume_image
+    from gcar_export.methods.rtk_geometry import volume_array, volume_image
 
     grid = Grid(center_mm=(1, 2, 3), size_mm=(5, 12, 21), shape=(5, 6, 7))
     volume = np.random.default_rng(0).random(grid.shape).astype(np.float32)
@@ -79,7 +79,7 @@ def test_sixteen_views_are_enough(tree, method, least):
     pytest.importorskip("itk")
     import importlib
 
-    solve = getattr(importlib.import_module(f"gcar_export.baselines.{method}"), method)
+    solve = getattr(importlib.import_module(f"gcar_export.methods.{method}"), method)
     found = solve(*pictures(tree, 16), GRID)
     assert found.min() >= 0
     assert found.max() <= 1

@@ -6,14 +6,14 @@ from click.testing import CliRunner
 
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import open_predictor
-from gcar_deploy.predict.model_spec import read_model
-from gcar_export import centers_table
-from gcar_export.centers import Truth
-from gcar_export.centers_table import Cost, Row, open_models, table
-from gcar_export.cli import main
-from gcar_export.golden import golden_inputs
-from gcar_export.predictor_process import peak_mib
+from gcar_export.cli.main import main
+from gcar_export.methods.predictor_process import peak_mib
+from gcar_export.shipping.golden import golden_inputs
+from gcar_export.studies import centers_table
+from gcar_export.studies.centers import Truth
+from gcar_export.studies.centers_table import Cost, Row, open_models, table
 from tests.conftest import data_dir
 from tests.predict.test_single_view import TINY
 

@@ -13,9 +13,9 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from gcar_deploy.errors import ModelError  # noqa: E402
-from gcar_export.cli import main  # noqa: E402
-from gcar_export.export_onnx import load_checkpoint  # noqa: E402
-from gcar_export.tiny_model import write_tiny_checkpoint  # noqa: E402
+from gcar_export.cli.main import main  # noqa: E402
+from gcar_export.shipping.export_onnx import load_checkpoint  # noqa: E402
+from gcar_export.shipping.tiny_model import write_tiny_checkpoint  # noqa: E402
 
 
 @pytest.fixture

@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 
 from gcar_deploy.errors import ModelError, RefusedError, UsageError
-from gcar_export import (
-    evaluate,
-    evaluation_engines,
-    evaluation_jobs,
-    evaluation_tables,
-    methods,
-    paper_tables,
-    score,
-)  # fmt: skip
-from gcar_export.labels import read_label
-from gcar_export.method_settings import DESCRIPTIONS, METHODS, MethodSettings
-from gcar_export.protocols import PROTOCOLS, make_case, write_case
+from gcar_export.evaluate import engines as evaluation_engines
+from gcar_export.evaluate import evaluate, paper_tables, score
+from gcar_export.evaluate import jobs as evaluation_jobs
+from gcar_export.evaluate import tables as evaluation_tables
+from gcar_export.evaluate.protocols import PROTOCOLS, make_case, write_case
+from gcar_export.methods import solve as methods
+from gcar_export.methods.settings import DESCRIPTIONS, METHODS, MethodSettings
+from gcar_export.scenes.labels import read_label
 from tests.conftest import data_dir
 
 
@@ -401,7 +397,7 @@ def test_score_reads_what_the_command_wrote(data, tmp_path, monkeypatch):
 def test_command_line_lists_its_verbs():
     from click.testing import CliRunner
 
-    from gcar_export.cli import main
+    from gcar_export.cli.main import main
 
     shown = CliRunner().invoke(main, ["--help"]).output
     for verb in ("evaluate", "converge", "score", "simulate", "pair-time"):

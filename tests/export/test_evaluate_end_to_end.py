@@ -10,12 +10,12 @@ import pytest
 from click.testing import CliRunner
 
 from gcar_deploy.errors import ModelError
-from gcar_export.cli import main
-from gcar_export.converge import converge
-from gcar_export.evaluate import EvaluateOptions, evaluate
-from gcar_export.evaluation_tables import MEASURES
-from gcar_export.method_settings import METHODS, MethodSettings
-from gcar_export.methods import check_models
+from gcar_export.cli.main import main
+from gcar_export.evaluate.evaluate import EvaluateOptions, evaluate
+from gcar_export.evaluate.tables import MEASURES
+from gcar_export.methods.settings import METHODS, MethodSettings
+from gcar_export.methods.solve import check_models
+from gcar_export.studies.converge import converge
 from tests.export.label_files import write_tree
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,9 @@ import sys
 import pytest
 
 from gcar_deploy.errors import UsageError
-from gcar_export import evaluation_engines
-from gcar_export.evaluate import EvaluateOptions, evaluate
-from gcar_export.method_settings import MethodSettings
+from gcar_export.evaluate import engines as evaluation_engines
+from gcar_export.evaluate.evaluate import EvaluateOptions, evaluate
+from gcar_export.methods.settings import MethodSettings
 from tests.export.label_files import write_tree
 
 

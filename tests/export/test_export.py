@@ -8,16 +8,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.predict.model_spec import read_model
-from gcar_export import parity as parity_module
-from gcar_export.export_onnx import load_checkpoint
-from gcar_export.networks.sparse import SparseConfig
-from gcar_export.networks.unet import UNetConfig
-from gcar_export.parity import Parity, accept, export_checked, parity
-from gcar_export.quantize import quantize_checked
-from gcar_export.task_check import task_measure, torch_predictor
-from gcar_export.tiny_model import TINY, TINY_SINGLE, write_tiny_checkpoint
-from gcar_export.verify import verify_model
+from gcar_deploy.models.spec import read_model
+from gcar_export.shipping import parity as parity_module
+from gcar_export.shipping.export_onnx import load_checkpoint
+from gcar_export.shipping.parity import Parity, accept, export_checked, parity
+from gcar_export.shipping.quantize import quantize_checked
+from gcar_export.shipping.task_check import task_measure, torch_predictor
+from gcar_export.shipping.tiny_model import TINY, TINY_SINGLE, write_tiny_checkpoint
+from gcar_export.shipping.verify import verify_model
+from gcar_export.training.networks.sparse import SparseConfig
+from gcar_export.training.networks.unet import UNetConfig
 
 pytestmark = pytest.mark.slow
 
@@ -101,12 +101,12 @@ def test_int8_is_kept_or_refused_with_figures(exported, monkeypatch):
     model = exported[1]
     before = model.read_bytes()
     twin = model.with_name("m-int8.onnx")
-    monkeypatch.setattr("gcar_export.quantize.MOST_LOST", 0.5)
+    monkeypatch.setattr("gcar_export.shipping.quantize.MOST_LOST", 0.5)
     said = quantize_checked(model, scenes=1, calibration=2)
     assert "int8 accepted, Dice 0." in said and read_model(twin).spec["precision"].startswith(
         "int8"
     )
-    monkeypatch.setattr("gcar_export.quantize.MOST_LOST", -1.0)
+    monkeypatch.setattr("gcar_export.shipping.quantize.MOST_LOST", -1.0)
     with pytest.raises(ModelError, match=r"int8 refused: Dice 0\.\d+ -> 0\.\d+ over 1 scenes"):
         quantize_checked(model, scenes=1, calibration=2)
     assert not twin.exists() and not twin.with_suffix(".json").exists()

@@ -7,13 +7,21 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the export extra")
 
-from gcar_deploy.agreement import check_agreement, check_order
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError
-from gcar_export.gate_pairs import KINDS, PICTURES, generated_subject, make_pair, real_subject
-from gcar_export.gate_report import doubt_table, draw, gate_table, level_table, status_table
-from gcar_export.gate_table import (
+from gcar_deploy.pose.agreement import check_agreement, check_order
+from gcar_export.evaluate.protocols import case_geometry, make_case
+from gcar_export.scenes.labels import read_label
+from gcar_export.studies.gate_pairs import (
+    KINDS,
+    PICTURES,
+    generated_subject,
+    make_pair,
+    real_subject,
+)
+from gcar_export.studies.gate_report import doubt_table, draw, gate_table, level_table, status_table
+from gcar_export.studies.gate_table import (
     Attempt,
     Row,
     choose,
@@ -24,8 +32,6 @@ from gcar_export.gate_table import (
     read_rows,
     replayed,
 )
-from gcar_export.labels import read_label
-from gcar_export.protocols import case_geometry, make_case
 from tests.conftest import data_dir
 
 GATES = QualityOptions()

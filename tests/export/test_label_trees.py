@@ -11,14 +11,15 @@ from scipy.spatial import cKDTree
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_export import train_multi, train_single
-from gcar_export.dataset import Capsules, SceneOptions, training_scene
-from gcar_export.label_trees import capsules_of, label_tree, read_label_trees
-from gcar_export.labels import LabelVolume, read_label
-from gcar_export.raycast import raycast
-from gcar_export.render import occupancy, path_lengths
-from gcar_export.single_dataset import training_pictures
-from gcar_export.train import start
+from gcar_export.scenes.label_trees import capsules_of, label_tree, read_label_trees
+from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.raycast import raycast
+from gcar_export.scenes.render import occupancy, path_lengths
+from gcar_export.training import multi as train_multi
+from gcar_export.training import single as train_single
+from gcar_export.training.dataset import Capsules, SceneOptions, training_scene
+from gcar_export.training.single_dataset import training_pictures
+from gcar_export.training.train import start
 
 
 def _helix(radius=18.0, turns=1.6, n=260):

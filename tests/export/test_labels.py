@@ -6,7 +6,7 @@ import pytest
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.grid import Grid
-from gcar_export.labels import LabelVolume, from_array, read_label
+from gcar_export.scenes.labels import LabelVolume, from_array, read_label
 from tests.conftest import data_dir
 
 nibabel = pytest.importorskip("nibabel")

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from gcar_export.losses import (
+from gcar_export.training.losses import (
     PAPER_START,
     chamfer,
     chamfer_weight,

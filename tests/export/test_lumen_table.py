@@ -10,14 +10,14 @@ import pytest
 pytest.importorskip("numba")
 from gcar_deploy.engine import Engine
 from gcar_deploy.tree.tree import Tree
-from gcar_export.lumen_table import compare, measure_case, point_graph, table
-from gcar_export.stenosis_cases import (
+from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
     Tube,
     generated_tubes,
     label_tubes,
     with_stenosis,
 )
+from gcar_export.studies.lumen_table import compare, measure_case, point_graph, table
 from tests.conftest import data_dir
 from tests.tree.shapes import branch, fork
 

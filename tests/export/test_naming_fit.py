@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gcar_deploy.tree.naming import Reading, name_branches, probabilities, readings
-from gcar_export.naming_cases import NamedTree, components, named_case, right_reading
-from gcar_export.naming_fit import FIGURES, Example, as_json, fit, table, tally
-from tests.tree.test_naming import left_tree
+from gcar_deploy.measure.naming import Reading, name_branches, probabilities, readings
+from gcar_export.studies.naming_cases import NamedTree, components, named_case, right_reading
+from gcar_export.studies.naming_fit import FIGURES, Example, as_json, fit, table, tally
+from tests.measure.test_naming import left_tree
 
 TRUE = ("LM", "LAD", "LCx", "LAD", "")
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gcar_deploy.metrics import best_dice
-from gcar_export.baselines.fbp_gaussians import fbp_centers
-from gcar_export.baselines.nerp import NerpOptions, nerp, ray_matrix, seen_voxels
-from gcar_export.raycast import raycast
+from gcar_deploy.measure.metrics import best_dice
+from gcar_export.methods.fbp_gaussians import fbp_centers
+from gcar_export.methods.nerp import NerpOptions, nerp, ray_matrix, seen_voxels
+from gcar_export.scenes.raycast import raycast
 from tests.export.test_baselines import GRID, carm, pictures, tree  # noqa: F401
 
 SMALL = NerpOptions(features=32, width=32, hidden_layers=2, steps=120, bandwidth=5.0)

@@ -16,7 +16,7 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.selftest import tiny_case
-from gcar_export.phantom import (
+from gcar_export.studies.phantom import (
     FOUR,
     Fit,
     estimate_shift,

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("torch", reason="needs the export extra")
 
-from gcar_export.pose_table import Row, aligned, chamfer_mm, markdown, measure
+from gcar_export.studies.pose_table import Row, aligned, chamfer_mm, markdown, measure
 
 
 def test_alignment_forgives_motion_and_nothing_else():

@@ -6,9 +6,9 @@ import pytest
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_export.labels import LabelVolume, read_label
-from gcar_export.raw_pictures import raw_picture
-from gcar_export.raycast import as_label, raycast
+from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.raw_pictures import raw_picture
+from gcar_export.scenes.raycast import as_label, raycast
 from tests.conftest import data_dir
 
 MOVED_MM, TURNED_DEG = (1.5, -2.0, 3.0), 1.0

@@ -9,13 +9,13 @@ pytest.importorskip("numba")
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.refine.targets import make_targets
 from gcar_deploy.selftest import tiny_case, tiny_tree
 from gcar_deploy.tree.tree import Tree
-from gcar_export import refine_table as refining
-from gcar_export import sigma_table as sigma
-from gcar_export.cost_curves import Curve
-from gcar_export.trees import SyntheticTree, Vessel
+from gcar_deploy.tubes.targets import make_targets
+from gcar_export.scenes.trees import SyntheticTree, Vessel
+from gcar_export.studies import refine_table as refining
+from gcar_export.studies import sigma_table as sigma
+from gcar_export.studies.cost_curves import Curve
 from tests.export.label_files import write_tree
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_export.render import occupancy, path_lengths
+from gcar_export.scenes.render import occupancy, path_lengths
 
 CARM = CArm(
     primary_angle_deg=30,

@@ -7,9 +7,18 @@ import pytest
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import separation_deg
-from gcar_export import robustness
-from gcar_export.labels import from_array
-from gcar_export.robustness import CURVES, Point, examine, noisy_rim, points, run, table, with_gaps
+from gcar_export.scenes.labels import from_array
+from gcar_export.studies import robustness
+from gcar_export.studies.robustness import (
+    CURVES,
+    Point,
+    examine,
+    noisy_rim,
+    points,
+    run,
+    table,
+    with_gaps,
+)
 from tests.conftest import data_dir
 
 

@@ -13,17 +13,17 @@ from gcar_deploy.errors import ModelError  # noqa: E402
 from gcar_deploy.imaging.extract import extract_vessels  # noqa: E402
 from gcar_deploy.imaging.learned import support  # noqa: E402
 from gcar_deploy.imaging.net import INPUT, Segmenter, net_input  # noqa: E402
-from gcar_deploy.predict.model_spec import read_model  # noqa: E402
-from gcar_export.angiogram_vessels import Vessels, catheter, random_vessels, ribbon  # noqa: E402
-from gcar_export.angiograms import (  # noqa: E402
+from gcar_deploy.models.spec import read_model  # noqa: E402
+from gcar_export.scenes.angiogram_vessels import Vessels, catheter, random_vessels, ribbon  # noqa: E402
+from gcar_export.scenes.angiograms import (  # noqa: E402
     SIDE,
     generated_angiogram,
     picture_with_mask,
     training_pair,
 )
-from gcar_export.export_segmenter import _GroupNorm, export_segmenter  # noqa: E402
-from gcar_export.networks.mask_unet import MaskUNet  # noqa: E402
-from gcar_export.train_segmenter import (  # noqa: E402
+from gcar_export.shipping.export_segmenter import _GroupNorm, export_segmenter  # noqa: E402
+from gcar_export.training.networks.mask_unet import MaskUNet  # noqa: E402
+from gcar_export.training.segmenter import (  # noqa: E402
     TINY,
     chord_loss,
     learning_rate,

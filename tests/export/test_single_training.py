@@ -10,12 +10,11 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.center_map import decode
-from gcar_export.checkpoint import read_manifest
-from gcar_export.networks.unet import UNetConfig, UNetPredictor
-from gcar_export.render import path_and_depth, path_lengths
-from gcar_export.run_folder import read_log
-from gcar_export.single_dataset import training_pictures
-from gcar_export.train_single import (
+from gcar_export.scenes.render import path_and_depth, path_lengths
+from gcar_export.training.checkpoint import read_manifest
+from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
+from gcar_export.training.run_folder import read_log
+from gcar_export.training.single import (
     CONFIGS,
     PRESETS,
     Batch,
@@ -24,6 +23,7 @@ from gcar_export.train_single import (
     learning_rate,
     train,
 )
+from gcar_export.training.single_dataset import training_pictures
 
 CONFIG = UNetConfig(pixels=64, alpha=2, width=(4, 4, 8))
 

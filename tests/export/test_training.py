@@ -7,10 +7,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from gcar_export.dataset import training_scene
-from gcar_export.networks.sparse import SparsePredictor
-from gcar_export.tiny_model import TINY
-from gcar_export.train_multi import (
+from gcar_export.shipping.tiny_model import TINY
+from gcar_export.training.dataset import training_scene
+from gcar_export.training.multi import (
     CONFIGS,
     PRESETS,
     TrainOptions,
@@ -19,6 +18,7 @@ from gcar_export.train_multi import (
     scene_loss,
     train,
 )
+from gcar_export.training.networks.sparse import SparsePredictor
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gcar_export.trees import MURRAY, random_tree
+from gcar_export.scenes.trees import MURRAY, random_tree
 
 
 def test_same_seed_same_tree_other_seed_other_tree():

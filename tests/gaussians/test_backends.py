@@ -11,9 +11,9 @@ from gcar_deploy.gaussians.backends import (
     PICTURE_TOLERANCE,
     backend_named,
 )
-from gcar_deploy.refine.paper import refine_paper
+from gcar_deploy.gaussians.paper import refine_paper
+from tests.gaussians.test_paper import OPTIONS, points, views_of
 from tests.gaussians.test_project import carm, random_gaussians
-from tests.refine.test_paper import OPTIONS, points, views_of
 
 
 @pytest.mark.parametrize(

@@ -199,7 +199,7 @@ def test_against_an_independent_projector():
     """itk-rtk through 0.5 mm voxels, which with Joseph's method limit the agreement."""
     pytest.importorskip("itk")
     from gcar_deploy.gaussians.voxelize import voxelize
-    from gcar_export.rtk_geometry import forward
+    from gcar_export.methods.rtk_geometry import forward
 
     g = random_gaussians(12, 10, spread=20, sigma=(1.5, 3.0))
     grid = Grid(center_mm=(0, 0, 0), size_mm=(80, 80, 80), shape=(160, 160, 160))

@@ -13,14 +13,14 @@ import pytest
 from gcar_deploy.config import PaperOptions
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.gaussians.paper import MOST_ANISOTROPY, refine_paper
 from gcar_deploy.gaussians.project import project
 from gcar_deploy.gaussians.voxelize import voxelize
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.refine.paper import MOST_ANISOTROPY, refine_paper
+from tests.gaussians.test_paper import views_of
 from tests.gaussians.test_project import random_gaussians
 from tests.hard.phantoms import carm
-from tests.refine.scenes import vessel_image
-from tests.refine.test_paper import views_of
+from tests.tubes.scenes import vessel_image
 
 OPTIONS = PaperOptions(steps=12, control_every=5, most_gaussians=60, pixel_mm=2.0, patience=60)
 

@@ -12,12 +12,12 @@ import pytest
 
 from gcar_deploy.config import PaperOptions
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.gaussians.paper import refine_paper
 from gcar_deploy.gaussians.project import project
 from gcar_deploy.geometry.epipolar import triangulate
 from gcar_deploy.geometry.observability import point_sigmas
-from gcar_deploy.refine.paper import refine_paper
 from tests.hard.phantoms import carm
-from tests.refine.scenes import vessel_image
+from tests.tubes.scenes import vessel_image
 
 ANGLES = np.linspace(1.0, 179.0, 21)
 #: root mean square error over the bound is held between these, from 20 to 160 deg

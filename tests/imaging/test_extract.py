@@ -164,7 +164,7 @@ def test_area_average_by_a_whole_factor_is_the_block_mean():
 
 
 def test_real_and_simulated_pictures():
-    from gcar_export import segmentation_table as table
+    from gcar_export.studies import segmentation_table as table
 
     data = data_dir()
     pairs = sorted(table.find(data, "xca_masks").glob("*_gt.png"))

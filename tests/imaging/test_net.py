@@ -76,7 +76,9 @@ def test_a_blank_picture_is_refused_by_both(net):
 @pytest.mark.slow
 def test_expert_masks(net):
     """Eight of the real pictures: neither way is far from the other, and both together neither."""
-    table = pytest.importorskip("gcar_export.segmentation_table", reason="needs the workshop")
+    table = pytest.importorskip(
+        "gcar_export.studies.segmentation_table", reason="needs the workshop"
+    )
     pairs = sorted(table.find(data_dir(), "xca_masks").glob("*_gt.png"))[::5]
     if not pairs:
         pytest.skip("GCAR_DATA has no xca_masks")

@@ -14,7 +14,7 @@ import pytest
 from gcar_deploy.cli.info import names_of
 from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.report_data import scene_data
-from tests.tree.test_naming import left_tree
+from tests.measure.test_naming import left_tree
 
 NAMES = ["LM", "LAD", "LCx", "LAD", None]
 

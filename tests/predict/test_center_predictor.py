@@ -10,14 +10,14 @@ import pytest
 
 from gcar_deploy.config import CandidateOptions, DecideOptions
 from gcar_deploy.errors import ModelError, NumericalError
-from gcar_deploy.predict.candidates import visual_hull
+from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor
-from gcar_deploy.predict.decide import decide
+from gcar_deploy.predict.decision import decide
 from gcar_deploy.predict.encoding import encode
-from gcar_deploy.predict.model_spec import read_model
+from gcar_deploy.predict.hull import visual_hull
 
-pytest.importorskip("gcar_export.render", reason="needs the export extra")
-from tests.predict.test_candidates import GRID, scene
+pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
+from tests.predict.test_hull import GRID, scene
 
 TINY = Path(__file__).parents[1] / "data" / "tiny.onnx"
 
@@ -129,8 +129,8 @@ def test_values_that_are_not_finite_are_an_error():
 def test_decision_explains_rays_and_prefers_the_likelier(calibrated):
     from dataclasses import replace
 
-    from gcar_export.render import occupancy
-    from tests.predict.test_candidates import helix
+    from gcar_export.scenes.render import occupancy
+    from tests.predict.test_hull import helix
 
     hull, encoded = inputs()
     p = helix()

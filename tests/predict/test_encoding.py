@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcar_deploy.config import CandidateOptions
-from gcar_deploy.predict.candidates import visual_hull
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES, _levels, _neighbours, encode
+from gcar_deploy.predict.hull import visual_hull
 from gcar_deploy.predict.thinning import thin_hull
 
-pytest.importorskip("gcar_export.render", reason="needs the export extra")
-from tests.predict.test_candidates import GRID, helix, scene
+pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
+from tests.predict.test_hull import GRID, helix, scene
 
 
 @settings(max_examples=40, deadline=None)
@@ -81,7 +81,7 @@ def test_weight_conserves_mass():
     views = scene()
     hull = visual_hull(views, GRID, CandidateOptions(min_path_cells=0.05))
     e = encode(hull, [(c, p, True) for c, p in views])
-    from gcar_export.render import occupancy
+    from gcar_export.scenes.render import occupancy
 
     p = helix()
     share, _, _ = occupancy(hull.points_mm, 1.0, p[:-1], p[1:], np.full(len(p) - 1, 1.6))

@@ -11,17 +11,17 @@ import pytest
 from gcar_deploy import Engine, RunOptions
 from gcar_deploy.config import CandidateOptions, PredictOptions, SingleViewOptions
 from gcar_deploy.errors import ModelError, NumericalError
-from gcar_deploy.predict import model_spec
-from gcar_deploy.predict.candidates import visual_hull
+from gcar_deploy.models import spec as model_spec
+from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_map import decode, encode_depth, net_picture
 from gcar_deploy.predict.center_predictor import SingleViewPredictor, open_predictor
 from gcar_deploy.predict.encoding import encode
-from gcar_deploy.predict.model_spec import read_model
+from gcar_deploy.predict.hull import visual_hull
 from gcar_deploy.predict.single_view import agreement, merge_views
 from gcar_deploy.selftest import tiny_case
 
-pytest.importorskip("gcar_export.render", reason="needs the export extra")
-from tests.predict.test_candidates import GRID, helix, scene
+pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
+from tests.predict.test_hull import GRID, helix, scene
 
 TINY = Path(__file__).parents[1] / "data" / "tiny-single.onnx"
 SINGLE = RunOptions(predict=PredictOptions(predictor="single"))
@@ -29,7 +29,7 @@ SINGLE = RunOptions(predict=PredictOptions(predictor="single"))
 
 def true_centers(views, error_mm=0.0, rng=None):
     """What a perfect single-view predictor would say: the helix's own depth in each cell."""
-    from gcar_export.render import path_and_depth
+    from gcar_export.scenes.render import path_and_depth
 
     line = helix()
     out = []
@@ -52,7 +52,7 @@ def dice(confidence, truth):
 
 @pytest.fixture(scope="module")
 def hull():
-    from gcar_export.render import occupancy
+    from gcar_export.scenes.render import occupancy
 
     views = scene(((-30, -20), (45, 25)))
     found = visual_hull(views, GRID, CandidateOptions())
@@ -165,7 +165,7 @@ def test_a_spec_that_does_not_fit_says_where(copy, key, value, message):
 
 
 def test_another_golden_answer_is_refused(copy):
-    from gcar_export.golden import write_golden
+    from gcar_export.shipping.golden import write_golden
 
     found = write_golden(copy)
     with np.load(found) as data:

@@ -22,8 +22,8 @@ from pynetdicom import AE
 from gcar_deploy.dicom.header import CLASSIC
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.refine.tube_model import footprint, tubes_of
 from gcar_deploy.selftest import tiny_tree
+from gcar_deploy.tubes.model import footprint, tubes_of
 from gcar_deploy.worker.jobs import JobQueue
 from gcar_deploy.worker.listen import Listener, tell
 from tests.dicom.files import classic, save

@@ -1,0 +1,209 @@
+"""``gcar-export evaluate`` and ``converge``: parse, call one function, print."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from gcar_deploy.errors import UsageError
+
+_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+_OUT = click.Path(path_type=Path)
+_PROTOCOL = click.option(
+    "--protocol",
+    type=click.Choice(["paper", "clinical", "moved", "raw"]),
+    default="paper",
+    show_default=True,
+)
+_PAPER_STEPS = click.option(
+    "--paper-steps", type=int, help="Steps of the paper's refinement in all rows that use it."
+)
+
+
+class _Progress:
+    """A bar on a terminal, a line per row elsewhere; on stderr, nothing with ``quiet``."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet, self._bar, self._at = quiet, None, 0
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        if self._quiet:
+            return
+        if not sys.stderr.isatty():
+            click.echo(f"[{done}/{total}] {text}", err=True)
+            return
+        if self._bar is None:
+            self._bar = click.progressbar(
+                length=total, file=sys.stderr, show_pos=True, item_show_func=lambda item: item
+            )
+        self._bar.update(done - self._at, text)
+        self._at = done
+
+    def close(self) -> None:
+        """Leave the bar as it is, on a line of its own."""
+        if self._bar is not None:
+            self._bar.render_finish()
+
+
+@click.command()
+@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@_PROTOCOL
+@click.option(
+    "--methods",
+    default="ours,multi,hull+tube,hull,visual_hull,fdk,sart,nerp",
+    show_default=True,
+    help="Comma-separated; the first is the one the others are tested against. 'help' lists all.",
+)
+@click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
+@click.option("--out", type=_OUT, required=True, help="Rows, tables, pictures, report.")
+@click.option("--jobs", default=1, show_default=True, help="Processes on this machine.")
+@click.option("--cases", default="", help="Only these cases, comma-separated.")
+@_PAPER_STEPS
+@click.option(
+    "--engine",
+    type=click.Choice(["processes", "dask"]),
+    default="processes",
+    show_default=True,
+    help="Where rows are made; dask needs --scheduler.",
+)
+@click.option("--scheduler", help="Address of a Dask scheduler, tcp://HOST:PORT.")
+@click.option(
+    "--changed",
+    type=click.Choice(["redo", "keep", "refuse"]),
+    default="redo",
+    show_default=True,
+    help="Rows in --out that were made with other settings.",
+)
+@click.option("--redo", default="", help="Make the rows of these methods anew in any case.")
+@click.option("--draw-only", is_flag=True, help="Tables and pictures anew from --out/cases.csv.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def evaluate(
+    data: Path,
+    protocol: str,
+    methods: str,
+    views: str,
+    out: Path,
+    jobs: int,
+    cases: str,
+    paper_steps: int | None,
+    engine: str,
+    scheduler: str | None,
+    changed: str,
+    redo: str,
+    draw_only: bool,
+    quiet: bool,
+) -> None:
+    """Run methods over label volumes, print the table, draw the pictures, write a report.
+
+    Goes on where an earlier run with the same --out stopped.
+
+    Example: gcar-export evaluate --data data --protocol clinical --methods ours,hull
+    --views 2,4 --out results
+    """
+    from gcar_export.evaluate import evaluate as evaluation
+    from gcar_export.evaluate import tables as evaluation_tables
+    from gcar_export.evaluate.report import draw
+    from gcar_export.methods.settings import DESCRIPTIONS, MethodSettings
+
+    if methods == "help":
+        for name, text in DESCRIPTIONS.items():
+            click.echo(f"{name:20} {text}")
+        return
+    options = evaluation.EvaluateOptions(
+        data=data,
+        out=out,
+        protocol=protocol,
+        methods=words(methods),
+        views=numbers(views),
+        jobs=jobs,
+        cases=words(cases),
+        engine=engine,
+        scheduler=scheduler,
+        changed=changed,
+        redo=words(redo),
+        settings=MethodSettings(paper_steps=paper_steps),
+    )
+    reference = options.methods[0]
+    if draw_only:
+        rows = evaluation_tables.read_case_rows(out / "cases.csv")
+        evaluation.write_summaries(rows, out, reference)
+    else:
+        progress = _Progress(quiet=quiet)
+        try:
+            rows = evaluation.evaluate(options, progress)
+        except KeyboardInterrupt:
+            click.echo(f"\nfinished rows are in {out}; the same command goes on", err=True)
+            raise
+        finally:
+            progress.close()
+    click.echo(evaluation_tables.markdown(rows, reference))
+    click.echo(draw(rows, out, reference))
+
+
+@click.command()
+@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@_PROTOCOL
+@click.option("--methods", default="nerp,fbp+paper", show_default=True, help="Comma-separated.")
+@click.option("--steps", default="25,50,100,200,400", show_default=True, help="Budgets.")
+@click.option("--views", default=2, show_default=True, help="2 .. 16")
+@click.option("--cases", default="", help="Only these cases, comma-separated.")
+@click.option("--out", type=_OUT, required=True, help="Rows, converge.csv, converge.png.")
+@click.option("--jobs", default=1, show_default=True, help="Processes on this machine.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def converge(
+    data: Path,
+    protocol: str,
+    methods: str,
+    steps: str,
+    views: int,
+    cases: str,
+    out: Path,
+    jobs: int,
+    quiet: bool,
+) -> None:
+    """Show how accuracy depends on the steps of the iterative methods.
+
+    Goes on where an earlier run with the same --out stopped.
+
+    Example: gcar-export converge --data data --cases 0001,0595 --out curves
+    """
+    from gcar_export.evaluate.evaluate import EvaluateOptions
+    from gcar_export.studies import converge as convergence
+
+    options = EvaluateOptions(
+        data=data,
+        out=out,
+        protocol=protocol,
+        methods=words(methods),
+        views=(views,),
+        cases=words(cases),
+        jobs=jobs,
+    )
+    progress = _Progress(quiet=quiet)
+    try:
+        rows = convergence.converge(options, numbers(steps), progress)
+    finally:
+        progress.close()
+    click.echo(convergence.table(rows))
+    click.echo(out / "converge.png")
+
+
+def words(text: str) -> tuple[str, ...]:
+    """Split at commas; blanks and empty parts go."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Split at commas into whole numbers.
+
+    Raises
+    ------
+    UsageError
+        Something else stands there.
+    """
+    try:
+        return tuple(int(word) for word in words(text))
+    except ValueError:
+        raise UsageError(f"{text!r} is not a comma-separated list of whole numbers") from None

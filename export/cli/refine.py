@@ -1,0 +1,92 @@
+"""The verbs about refinement: from true starts, what it costs, and whether its sigma is true."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from gcar_deploy.errors import UsageError
+from gcar_export.cli.evaluate import words
+
+_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+
+
+@click.command("refine-table")
+@click.option("--data", type=_FOLDER, required=True, help="Folder with label volumes.")
+@click.option("--cases", default="", help="Only these cases, comma-separated.")
+@click.option("--protocols", default="paper,clinical", show_default=True)
+@click.option("--noises", default="0,0.5,1,2", show_default=True, help="Start noise, voxels.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=None,
+    help="Folder that keeps every fit; a run with the same folder goes on where it stopped.",
+)
+def refine_table(data: Path, cases: str, protocols: str, noises: str, out: Path | None) -> None:
+    """Refine from the same true and noisy points in both modes, with and without centreline loss.
+
+    Example: gcar-export refine-table --data data --cases 0001,0134,0595 --out fits
+    """
+    from gcar_export.studies import refine_table as refining
+
+    try:
+        levels = [float(word) for word in words(noises)]
+    except ValueError:
+        raise UsageError(f"--noises {noises!r} is not a comma-separated list of numbers") from None
+    count = len(refining.labels_of(data, words(cases)))
+    if not count:
+        raise UsageError(f"--cases {cases}: none of them is in {data}")
+    total = count * len(levels) * len(refining.MODES) * len(words(protocols))
+    tables = []
+    with click.progressbar(length=total, label="fits", file=sys.stderr) as bar:
+        for protocol in words(protocols):
+            rows = refining.refine_rows(
+                data, protocol, words(cases), levels, out, lambda: bar.update(1)
+            )
+            tables.append(refining.table(rows, protocol))
+    click.echo("\n\n".join(tables))
+
+
+@click.command("cost-curves")
+def cost_curves() -> None:
+    """Time refinement against Gaussians, views and pixels, and print the exponents.
+
+    Example: gcar-export cost-curves
+    """
+    from gcar_export.studies import cost_curves as cost
+
+    total = len(cost.GAUSSIANS) + len(cost.VIEWS) + len(cost.PIXELS)
+    with click.progressbar(length=total, label="sizes", file=sys.stderr) as bar:
+        found = cost.curves(lambda: bar.update(1))
+    click.echo(cost.table(found))
+
+
+@click.command("sigma-table")
+@click.option("--seed", default=1, show_default=True, help="Population of generated trees.")
+@click.option("--trees", default=10, show_default=True, help="Trees per row.")
+@click.option("--protocols", default="paper,clinical", show_default=True)
+@click.option("--predictors", default="multi,none", show_default=True)
+@click.option("--parts", is_flag=True, help="Also what sigma is worth without some of its parts.")
+def sigma_table(seed: int, trees: int, protocols: str, predictors: str, parts: bool) -> None:
+    """Compare the stated sigma with true errors on generated trees.
+
+    Example: gcar-export sigma-table --seed 2 --trees 20
+    """
+    from gcar_export.studies import sigma_table as sigma
+
+    cells = [
+        (protocol, condition, predictor)
+        for protocol in words(protocols)
+        for condition in sigma.CONDITIONS
+        for predictor in words(predictors)
+    ]
+    rows = []
+    with click.progressbar(length=len(cells) * trees, label="trees", file=sys.stderr) as bar:
+        for cell in cells:
+            made = sigma.calibrate_parts(
+                *cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1)
+            )
+            rows += made if parts else made[-1:]
+    click.echo(sigma.table(rows))

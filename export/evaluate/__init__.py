@@ -1,0 +1,1 @@
+"""Evaluation of methods side by side: protocols, jobs, scores, tables, report."""

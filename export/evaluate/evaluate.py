@@ -1,0 +1,232 @@
+"""Evaluate methods over label volumes: simulate, reconstruct, measure, tabulate, draw.
+
+One job is one case, one number of views and one method; its row is written as soon as it
+is done, so an interrupted evaluation goes on where it stopped. Every row remembers the
+settings it was made with: rows of other settings are made anew, or refused, and never mixed
+in unsaid.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.errors import UsageError
+from gcar_export.evaluate import paper_tables, tables
+from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
+from gcar_export.evaluate.jobs import Job, case_name, row_path, write_done
+from gcar_export.evaluate.protocols import PROTOCOLS
+from gcar_export.methods.settings import METHODS, MethodSettings
+from gcar_export.methods.solve import check_models
+
+LOGGER = logging.getLogger(__name__)
+#: where label volumes are looked for below the data folder, in this order.
+LABEL_PATTERNS = (
+    "imagecas/*.label.nii.gz", "asoca/*.npz", "asoca/*.nrrd",
+    "*.label.nii.gz", "*.nii.gz", "*.nrrd", "*.mha",
+)  # fmt: skip
+#: what to do with rows that were made with other settings.
+CHANGED = ("redo", "keep", "refuse")
+OnProgress = Callable[[int, int, str], None]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """What to evaluate.
+
+    Attributes
+    ----------
+    data : folder with label volumes (``imagecas/``, ``asoca/``, or the files themselves; a
+        folder that holds them in ``data/`` is taken as well)
+    out : folder for rows, tables and pictures; may hold an interrupted evaluation
+    protocol : one of ``PROTOCOLS``
+    methods : names from ``METHODS``
+    views : numbers of views
+    jobs : processes
+    cases : only cases with these names; all if empty
+    reference : method the others are tested against; the first of ``methods`` if None
+    engine : one of ``ENGINES``
+    scheduler : address of the Dask scheduler
+    changed : one of ``CHANGED``
+    redo : methods whose rows are made anew in any case
+    settings : MethodSettings
+    """
+
+    data: Path
+    out: Path
+    protocol: str
+    methods: tuple[str, ...]
+    views: tuple[int, ...] = (2,)
+    jobs: int = 1
+    cases: tuple[str, ...] = ()
+    reference: str | None = None
+    engine: str = "processes"
+    scheduler: str | None = None
+    changed: str = "redo"
+    redo: tuple[str, ...] = ()
+    settings: MethodSettings = dataclasses.field(default_factory=MethodSettings)
+
+    def __post_init__(self) -> None:
+        if self.protocol not in PROTOCOLS:
+            raise UsageError(f"protocol {self.protocol!r} is none of {', '.join(PROTOCOLS)}")
+        unknown = [m for m in self.methods if m not in METHODS]
+        if unknown or not self.methods:
+            raise UsageError(f"unknown method {unknown}; there are {', '.join(METHODS)}")
+        if not self.views or any(not 2 <= n <= 16 for n in self.views):
+            raise UsageError(f"views = {self.views!r} must be numbers from 2 to 16")
+        if self.jobs < 1:
+            raise UsageError(f"jobs = {self.jobs} must be at least 1")
+        if self.reference is not None and self.reference not in self.methods:
+            raise UsageError(f"reference {self.reference!r} is not among the methods")
+        if self.engine not in ENGINES:
+            raise UsageError(f"engine {self.engine!r} is none of {', '.join(ENGINES)}")
+        if self.changed not in CHANGED:
+            raise UsageError(f"changed = {self.changed!r} is none of {', '.join(CHANGED)}")
+        if set(self.redo) - set(self.methods):
+            raise UsageError(f"redo = {', '.join(self.redo)}: not all are among the methods")
+
+
+def find_labels(data: Path) -> list[Path]:
+    """Label volumes below a folder: ImageCAS, ASOCA, or any mask lying in it.
+
+    Raises
+    ------
+    UsageError
+        If there are none.
+    """
+    found: dict[Path, None] = {}
+    for folder in (data, data / "data"):
+        for pattern in LABEL_PATTERNS:
+            for path in sorted(folder.glob(pattern)):
+                found.setdefault(path.resolve())
+        if found:
+            return list(found)
+    raise UsageError(f"no label volume in {data} ({', '.join(LABEL_PATTERNS)})")
+
+
+def evaluate(
+    options: EvaluateOptions, on_progress: OnProgress | None = None
+) -> list[dict[str, Any]]:
+    """Run what is missing, write the tables, and return all rows.
+
+    Parameters
+    ----------
+    options : EvaluateOptions
+    on_progress : called with (done, total, text) after each row
+
+    Raises
+    ------
+    UsageError
+        No label volume; rows of other settings and ``changed`` is ``refuse``; no cluster.
+    ModelError
+        A method's model is missing.
+    """
+    labels = [p for p in find_labels(options.data) if _wanted(p, options.cases)]
+    if not labels:
+        raise UsageError(f"none of the cases {', '.join(options.cases)} is in {options.data}")
+    check_models(options.methods, options.settings)
+    digests = {method: options.settings.digest(method) for method in options.methods}
+    jobs = [
+        Job(
+            label=label, protocol=options.protocol, method=method, views=views,
+            digest=digests[method],
+        )
+        for label in labels
+        for views in options.views
+        for method in options.methods
+    ]  # fmt: skip
+    missing = _missing(jobs, options)
+    for folder in ("rows", "sides"):
+        (options.out / folder).mkdir(parents=True, exist_ok=True)
+    _write_settings(options)
+    done = len(jobs) - len(missing)
+    if on_progress is not None and done:
+        on_progress(done, len(jobs), f"{done} rows kept")
+    # Closed at once, also by an interrupt: workers must not outlive the loop.
+    with contextlib.closing(_outcomes(missing, options)) as outcomes:
+        for job, outcome in outcomes:
+            write_done(options.out, job, outcome)
+            done += 1
+            if on_progress is not None:
+                on_progress(done, len(jobs), job.name)
+    rows = [_read(row_path(options.out, job)) for job in jobs]
+    write_tables(rows, options.out, options.reference or options.methods[0])
+    return rows
+
+
+def write_tables(rows: Sequence[dict[str, Any]], out: Path, reference: str) -> None:
+    """Write ``cases.csv``, ``summary.json``, ``wilcoxon.json`` and ``tables.md``."""
+    (out / "cases.csv").write_text(tables.case_rows_csv(rows))
+    write_summaries(rows, out, reference)
+
+
+def write_summaries(rows: Sequence[dict[str, Any]], out: Path, reference: str) -> None:
+    """Write what follows from ``cases.csv``: the summary, the tests, the tables."""
+    summary = json.dumps(tables.summarise(rows), indent=1, allow_nan=False)
+    (out / "summary.json").write_text(summary)
+    tests = json.dumps(tables.paired_tests(rows, reference), indent=1, allow_nan=False)
+    (out / "wilcoxon.json").write_text(tests)
+    text = [tables.markdown(rows, reference), tables.over_views(rows)]
+    text.append(paper_tables.layout(rows, reference))
+    short = tables.not_first(rows, reference) + tables.worse_with_views(rows, reference)
+    text.append(f"Where {reference} is not first with p < 0.05:\n")
+    text += [f"- {sentence}" for sentence in short] or ["- nowhere"]
+    (out / "tables.md").write_text("\n".join(part for part in text if part) + "\n")
+
+
+def _missing(jobs: Sequence[Job], options: EvaluateOptions) -> list[Job]:
+    """Jobs without a row, and those whose row is out of date, which is said aloud."""
+    missing, changed = [], []
+    for job in jobs:
+        path = row_path(options.out, job)
+        if not path.exists() or job.method in options.redo:
+            missing.append(job)
+        elif _read(path).get("settings") != job.digest:
+            changed.append(job)
+    if not changed:
+        return missing
+    methods = ", ".join(dict.fromkeys(job.method for job in changed))
+    said = f"{len(changed)} rows of {methods} in {options.out} were made with other settings"
+    if options.changed == "refuse":
+        raise UsageError(f"{said}: take another --out, or --changed redo or keep")
+    if options.changed == "keep":
+        LOGGER.warning("%s: kept as they are", said)
+        return missing
+    LOGGER.warning("%s: made again", said)
+    order = {job: k for k, job in enumerate(jobs)}
+    return sorted([*missing, *changed], key=order.__getitem__)
+
+
+def _outcomes(jobs: Sequence[Job], options: EvaluateOptions) -> Generator[Outcome, None, None]:
+    if not jobs:
+        return
+    if options.engine == "dask":
+        yield from run_on_dask(jobs, options.settings, options.scheduler)
+    else:
+        yield from run_in_processes(jobs, options.settings, options.jobs)
+
+
+def _write_settings(options: EvaluateOptions) -> None:
+    """Add the settings of these methods to ``settings.json``, for whoever reads the folder."""
+    path = options.out / "settings.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    for method in options.methods:
+        known[method] = {
+            "digest": options.settings.digest(method),
+            "settings": options.settings.of(method),
+        }
+    path.write_text(json.dumps(known, indent=1, default=str))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    row: dict[str, Any] = json.loads(path.read_text())
+    return row
+
+
+def _wanted(label: Path, names: Sequence[str]) -> bool:
+    return not names or case_name(label) in names or label.name.split(".")[0] in names

@@ -1,0 +1,205 @@
+"""One row of an evaluation: a case, a number of views, a method; made anywhere, kept as files.
+
+``run_job`` needs nothing but the label file, so that it runs in another process or on another
+machine; its outcome comes back as plain values and is written by whoever asked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcar_deploy.measure.metrics import (
+    Measure,
+    best_shifted_dice,
+    projection_measures,
+    volume_measures,
+)
+from gcar_deploy.types import Array, Volume
+from gcar_export.evaluate.protocols import Case, make_case
+from gcar_export.methods.settings import MethodSettings
+from gcar_export.methods.solve import Solved, solve
+from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.raycast import as_label, raycast
+
+#: name that the truth's own pictures are kept under, beside the methods.
+TRUTH = "truth"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Job:
+    """One row to be made.
+
+    Attributes
+    ----------
+    label : label volume
+    protocol, method, views : what to do with it
+    digest : of the method's settings; a row with another one is out of date
+    """
+
+    label: Path
+    protocol: str
+    method: str
+    views: int
+    digest: str
+
+    @property
+    def case(self) -> str:
+        """Name of the case, as ``read_label`` gives it."""
+        return case_name(self.label)
+
+    @property
+    def name(self) -> str:
+        """Stem of the row's files."""
+        return f"{self.protocol}-{self.case}-{self.views}-{self.method}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Done:
+    """Outcome of a job: the row, and the tree from three sides.
+
+    Attributes
+    ----------
+    row : plain values, as ``rows/*.json`` holds them
+    sides, truth_sides : (rows, columns) uint8 from ``three_sides``; None without a volume
+    """
+
+    row: dict[str, Any]
+    sides: Array | None
+    truth_sides: Array
+
+
+def case_name(label: Path) -> str:
+    """Name of the case a label file holds, as ``read_label`` gives it."""
+    stem = label.name.split(".")[0]
+    return f"asoca_{stem}" if label.suffix == ".npz" else stem
+
+
+def run_job(job: Job, settings: MethodSettings) -> Done:
+    """Make one row."""
+    case = _case(job.label, job.protocol, job.views)
+    solved = solve(case, job.method, settings)
+    found = measure(case, solved)
+    row = {
+        "protocol": job.protocol,
+        "dataset": dataset(job.label),
+        "case": case.name,
+        "method": job.method,
+        "views": job.views,
+        "status": solved.status,
+        "sentence": solved.sentence,
+        "measures": {name: m.value for name, m in found.items()},
+        "reasons": {name: m.reason for name, m in found.items() if m.reason is not None},
+        "gaussians": solved.gaussians,
+        "seconds": float(solved.seconds["total"]),
+        "cpu_seconds": float(solved.seconds["cpu"]),
+        "stages": {s: float(t) for s, t in solved.seconds.items() if s not in ("total", "cpu")},
+        "settings": job.digest,
+    }
+    finite = solved.volume is not None and bool(np.isfinite(solved.volume).all())
+    return Done(
+        row=row,
+        sides=three_sides(solved.volume) if finite and solved.volume is not None else None,
+        truth_sides=three_sides(case.truth),
+    )
+
+
+def dataset(label: Path) -> str:
+    """``ASOCA`` for files below a folder of that name, ``ImageCAS`` likewise, else ``labels``."""
+    return {"asoca": "ASOCA", "imagecas": "ImageCAS"}.get(label.parent.name.lower(), "labels")
+
+
+def measure(case: Case, solved: Solved) -> dict[str, Measure]:
+    """All measures of one solved case, by the names of ``evaluation_tables.MEASURES``.
+
+    New projections are cast from the returned volume, clipped to 0 .. 1, and averaged over
+    the case's new views (those on which the measure is defined). Where the patient moved between
+    the views, DSC is also given for the best common shift, which no two views can see.
+    """
+    found = volume_measures(case.truth, solved.volume, case.grid.spacing_mm)
+    if case.protocol == "moved":
+        found["shifted_dsc"] = best_shifted_dice(case.truth, solved.volume)
+    per_view = []
+    for carm, truth_mm in zip(case.new_views, case.new_projections(), strict=True):
+        predicted = None
+        if solved.volume is not None and np.isfinite(solved.volume).all():
+            volume = as_label(np.clip(solved.volume, 0, 1), case.grid)
+            predicted = raycast(volume, carm)
+        per_view.append(projection_measures(truth_mm, predicted))
+    for name in per_view[0]:
+        found[f"new_{name}"] = _mean([view[name] for view in per_view])
+    return found
+
+
+def three_sides(volume: Volume) -> Array:
+    """Greatest occupancy along y, x and z, side by side: from the front, the left, above.
+
+    Parameters
+    ----------
+    volume : (nx, ny, nz), 0 .. 1; x to the left, y to the back, z to the head
+
+    Returns
+    -------
+    (max(nz, ny), nx + ny + nx) uint8, 255 for full; head and back upwards
+    """
+    shares = np.clip(volume, 0.0, 1.0)
+    front, left = shares.max(axis=1).T[::-1], shares.max(axis=0).T[::-1]
+    above = shares.max(axis=2).T[::-1]
+    rows = max(front.shape[0], above.shape[0])
+    sides = [np.pad(s, ((0, rows - s.shape[0]), (0, 0))) for s in (front, left, above)]
+    return np.rint(255.0 * np.concatenate(sides, axis=1)).astype(np.uint8)
+
+
+def row_path(out: Path, job: Job) -> Path:
+    """Where the row of a job is kept."""
+    return out / "rows" / f"{job.name}.json"
+
+
+def sides_path(out: Path, protocol: str, case: str, views: int, method: str) -> Path:
+    """Where the three sides of a row's tree are kept; those of the truth for every views."""
+    views = 0 if method == TRUTH else views
+    return out / "sides" / f"{protocol}-{case}-{views}-{method}.png"
+
+
+def write_done(out: Path, job: Job, done: Done) -> None:
+    """Write pictures first and the row last: a row that exists is whole."""
+    import cv2
+
+    for method, sides in ((job.method, done.sides), (TRUTH, done.truth_sides)):
+        path = sides_path(out, job.protocol, job.case, job.views, method)
+        if sides is None:
+            path.unlink(missing_ok=True)
+        elif method != TRUTH or not path.exists():
+            _replace(path, cv2.imencode(".png", sides)[1].tobytes())
+    text = json.dumps(done.row, indent=1, allow_nan=False)
+    _replace(row_path(out, job), text.encode())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial.write_bytes(content)
+    partial.replace(path)
+
+
+@functools.lru_cache(maxsize=1)
+def _label(path: Path) -> LabelVolume:
+    return read_label(path)
+
+
+@functools.lru_cache(maxsize=1)
+def _case(path: Path, protocol: str, views: int) -> Case:
+    return make_case(_label(path), protocol, views)
+
+
+def _mean(measures: Sequence[Measure]) -> Measure:
+    values = [m.value for m in measures if m.value is not None]
+    if values:
+        return Measure(float(np.mean(values)))
+    return Measure(None, measures[0].reason)

@@ -1,0 +1,1 @@
+"""Scenes: trees, label volumes, exact projections and generated angiograms."""

@@ -1,0 +1,155 @@
+"""What is behind the vessels of a generated angiogram, and what the machine makes of it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from gcar_deploy.types import Array, Image, Mask
+from gcar_export.scenes.raw_pictures import RawOptions, _anatomy
+
+
+def scenery(
+    rng: np.random.Generator, side: int, pixel_mm: float, wires: float
+) -> tuple[Image, Image]:
+    """(side, side) attenuation of the patient and of devices, without vessels and catheter.
+
+    ``wires``: guide wires and leads in a picture, on average.
+    """
+    ground = _subtracted if rng.random() < 0.25 else _patient
+    out = ground(rng, side)
+    devices = _devices(rng, side, pixel_mm, wires)
+    return out, cv2.GaussianBlur(devices, (0, 0), 0.7)
+
+
+def _subtracted(rng: np.random.Generator, side: int) -> Image:
+    """Return what a subtraction leaves: hardly any ground, but ghosts of what moved."""
+    out = rng.uniform(0.01, 0.06) * _noise(rng, side, rng.uniform(0.1, 0.5) * side)
+    for _ in range(rng.integers(0, 5)):
+        edge = np.diff(_border(rng, side, rng.uniform(0.01, 0.03)), axis=0, prepend=0)
+        out = out + rng.uniform(-1.5, 1.5) * edge
+    return out.astype(np.float32)
+
+
+def _patient(rng: np.random.Generator, side: int) -> Image:
+    options = RawOptions(
+        background=float(rng.uniform(0.03, 0.3)),
+        spine=float(rng.uniform(0, 0.3) * (rng.random() < 0.5)),
+        rib=float(rng.uniform(0, 0.12) * (rng.random() < 0.5)),
+        diaphragm=float(rng.uniform(0.05, 0.7) * (rng.random() < 0.4)),
+    )
+    if rng.random() < 0.5:
+        out = _anatomy((side, side), rng, options)
+    else:  # smoother ground, as behind a picture that fills the screen
+        out = rng.uniform(0.05, 0.4) * _noise(rng, side, rng.uniform(0.2, 0.5) * side)
+        out = out + rng.uniform(0.01, 0.06) * _noise(rng, side, rng.uniform(0.04, 0.1) * side)
+    for _ in range(rng.integers(0, 4)):  # lung, heart, diaphragm, spine: one smooth border each
+        out = out + rng.uniform(0.05, 0.6) * _border(rng, side, rng.uniform(0.003, 0.06))
+    # vessels of the lung and small ones of the heart, too fine to be followed
+    fine = _noise(rng, side, rng.uniform(1.2, 4.0))
+    if rng.random() < 0.5:
+        fine = -np.abs(fine) * 1.5
+    return (out + rng.uniform(0.0, 0.035) * fine).astype(np.float32)
+
+
+def _noise(rng: np.random.Generator, side: int, scale_px: float) -> Array:
+    """Smooth noise of unit variance."""
+    coarse = max(1, int(scale_px / 4))
+    size = max(8, -(-side // coarse) + 2)
+    small = ndimage.gaussian_filter(
+        rng.standard_normal((size, size)), scale_px / coarse, mode="wrap"
+    )
+    small = (small - small.mean()) / max(float(small.std()), 1e-9)
+    large = cv2.resize(small, (size * coarse, size * coarse), interpolation=cv2.INTER_CUBIC)
+    return large[:side, :side]
+
+
+def _border(rng: np.random.Generator, side: int, softness: float) -> Array:
+    """From 0 to 1 across a bent line."""
+    row, col = np.indices((side, side)) / side - rng.uniform(0.1, 0.9, 2)[:, None, None]
+    turn = rng.uniform(0, 2 * np.pi)
+    along = row * np.cos(turn) + col * np.sin(turn)
+    off = col * np.cos(turn) - row * np.sin(turn) - rng.uniform(-1.2, 1.2) * along**2
+    off = off + rng.uniform(0, 0.02) * np.sin(2 * np.pi * rng.uniform(1, 4) * along)
+    return 1 / (1 + np.exp(np.clip(-off / softness, -50, 50)))
+
+
+def _devices(rng: np.random.Generator, side: int, pixel_mm: float, wires: float) -> Image:
+    """Attenuation of wires, leads, sternal wires and electrodes."""
+    out = np.zeros((side, side), np.float32)
+    for _ in range(rng.poisson(wires)):  # guide wires, pacing leads
+        points = rng.uniform(-20, side + 20, (4, 2))
+        _stroke(out, list(points), rng.uniform(0.3, 1.2) / pixel_mm, rng.uniform(0.1, 0.6))
+    if rng.random() < 0.1:  # sternal wires
+        at = rng.uniform(0, side)
+        for row in np.arange(rng.uniform(0, 40), side, rng.uniform(40, 80)):
+            turn = rng.uniform(-9, 9, (4, 2)) + np.array([at, row])
+            _stroke(out, [*turn, turn[0]], 0.9 / pixel_mm, 0.7)
+    for _ in range(rng.poisson(0.15)):  # electrodes
+        center = tuple(int(x) for x in rng.uniform(0, side, 2))
+        cv2.circle(out, center, int(rng.uniform(2, 7) / pixel_mm), rng.uniform(0.1, 0.4), -1)
+    return out
+
+
+def _stroke(out: Image, corners: list, width_px: float, strength: float) -> None:
+    """Draw a smooth curve of even width through (col, row) corners."""
+    corners = np.asarray(corners, float)
+    t = np.linspace(0, len(corners) - 1, 200)
+    line = np.stack([np.interp(t, np.arange(len(corners)), c) for c in corners.T], 1)
+    line = ndimage.gaussian_filter1d(line, 18, axis=0, mode="nearest")
+    canvas = np.zeros_like(out)
+    points, width = np.rint(line * 16).astype(np.int32), max(1, round(width_px))
+    cv2.polylines(canvas, [points], False, 1.0, width, cv2.LINE_AA, 4)
+    out += np.float32(strength) * canvas
+
+
+def moved(rng: np.random.Generator, picture: Image) -> Image:
+    """Blur along one direction: the heart moves during the exposure."""
+    length = rng.uniform(0, 4)
+    if length < 1:
+        return picture
+    angle = rng.uniform(0, np.pi)
+    kernel = np.zeros((9, 9), np.float32)
+    half = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
+    first, last = (tuple(int(x) for x in np.rint(16 * (4 + s * half))) for s in (-1, 1))
+    cv2.line(kernel, first, last, 1.0, 1, cv2.LINE_AA, 4)
+    return cv2.filter2D(picture, -1, kernel / kernel.sum())
+
+
+def exposed(rng: np.random.Generator, absorbed: Image) -> tuple[Image, Mask]:
+    """Quanta behind patient and collimator; the field that the collimator leaves open."""
+    side = absorbed.shape[0]
+    field = np.ones((side, side), bool)
+    kind = rng.random()
+    if kind < 0.2:
+        edges = rng.integers(0, 22, 4)
+        field[:] = False
+        field[edges[0] : side - edges[1], edges[2] : side - edges[3]] = True
+    elif kind < 0.6:
+        row, col = (
+            np.indices(field.shape) - side * (0.5 + rng.uniform(-0.15, 0.15, 2))[:, None, None]
+        )
+        field = np.hypot(row, col) < side * rng.uniform(0.48, 0.75)
+    shade = np.where(field, 0.0, rng.uniform(1.5, 4.0))
+    light = ndimage.gaussian_filter(np.exp(-(absorbed + shade)), rng.uniform(0.3, 1.1))
+    quanta = float(np.exp(rng.uniform(np.log(150), np.log(8000))))
+    counts = rng.poisson(quanta * light) / quanta
+    return ndimage.gaussian_filter(counts, rng.uniform(0.2, 1.0)).astype(np.float32), field
+
+
+def displayed(rng: np.random.Generator, light: Image, field: Mask) -> Array:
+    """Gamma or logarithm, edge enhancement, window, 8 bit, at times JPEG."""
+    picture = light ** rng.uniform(0.5, 1.3) if rng.random() < 0.6 else np.log(light + 0.03)
+    if rng.random() < 0.5:
+        wide = ndimage.gaussian_filter(picture, rng.uniform(2, 8))
+        picture = picture + rng.uniform(0.2, 1.0) * (picture - wide)
+    low, high = np.quantile(picture[field], [rng.uniform(0, 0.02), 1 - rng.uniform(0, 0.03)])
+    floor, top = rng.uniform(0, 80), rng.uniform(150, 255)
+    grey = floor + (top - floor) * (picture - low) / max(float(high - low), 1e-9)
+    out = np.clip(grey, 0, 255).round().astype(np.uint8)
+    if rng.random() < 0.4:
+        quality = int(rng.uniform(55, 95))
+        _, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        out = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    return out

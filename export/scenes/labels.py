@@ -1,0 +1,316 @@
+"""Coronary label volumes: read, split into left and right tree, area-average onto a grid.
+
+Every reader ends in the same value, a ``LabelVolume`` whose axes run along patient LPS, so
+that nothing downstream knows whether a tree came from ImageCAS (``*.label.nii.gz``), ASOCA
+(``.nrrd``, or the released ``.npz``) or any other NIfTI, NRRD or MetaImage mask.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
+from scipy import ndimage
+
+from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.types import Array, Points, Volume
+from gcar_export.scenes.label_formats import read_metaimage, read_nrrd
+
+#: voxel edge of the ASOCA case released as a bare 128^3 array: the paper's 180 mm cube.
+ASOCA_NPZ_SPACING_MM = 180.0 / 128
+#: an affine this far (relative) from axis-parallel is resampled instead of relabelled.
+OBLIQUE_TOLERANCE = 1e-3
+#: empty voxels kept round the tree when a volume is cropped.
+MARGIN_VOXELS = 2
+#: a file is cropped on reading when the tree's box is a smaller share of it than this.
+CROP_BELOW = 0.5
+#: label trees whose box centre is this close to the isocentre are left where they are.
+CENTRED_WITHIN_MM = 2.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class LabelVolume:
+    """Share of each voxel that is vessel, on a block of voxels parallel to LPS.
+
+    Attributes
+    ----------
+    occupancy : (nx, ny, nz) float32, 0 .. 1
+        0 and 1 only for a mask.
+    grid : Grid
+        Where those voxels are, mm LPS.
+    name : str
+        Case name, from the file.
+    """
+
+    occupancy: Volume
+    grid: Grid
+    name: str = "label"
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume of the vessels, mm^3."""
+        return float(self.occupancy.sum(dtype=np.float64) * np.prod(self.grid.spacing_mm))
+
+    @property
+    def affine(self) -> Array:
+        """(4, 4) voxel index to mm RAS."""
+        return self.grid.affine_ras()
+
+    def box_mm(self) -> tuple[Points, Points]:
+        """Return centres of the lowest and highest occupied voxels, (3,) mm LPS each."""
+        low, high = _occupied_box(self.occupancy)
+        return self.grid.index2world(low), self.grid.index2world(high)
+
+    def cropped(self) -> LabelVolume:
+        """Return the occupied box with a margin of ``MARGIN_VOXELS`` empty voxels."""
+        low, high = _occupied_box(self.occupancy)
+        low, high = low - MARGIN_VOXELS, high + 1 + MARGIN_VOXELS
+        inner_low, inner_high = np.maximum(low, 0), np.minimum(high, self.occupancy.shape)
+        core = self.occupancy[
+            tuple(slice(a, b) for a, b in zip(inner_low, inner_high, strict=True))
+        ]
+        pad = list(zip(inner_low - low, high - inner_high, strict=True))
+        return self._on(np.pad(core, pad), self.grid.lower_mm + low * self.grid.spacing_mm)
+
+    def moved(self, shift_mm: Array) -> LabelVolume:
+        """Return the same tree moved by (3,) mm LPS."""
+        center = np.asarray(self.grid.center_mm) + np.asarray(shift_mm, dtype=np.float64)
+        grid = dataclasses.replace(self.grid, center_mm=tuple(center.tolist()))
+        return dataclasses.replace(self, grid=grid)
+
+    def centred(self) -> LabelVolume:
+        """Return the tree moved so that the middle of its occupied box is the isocentre."""
+        low, high = self.box_mm()
+        return self.moved(-0.5 * (low + high))
+
+    def roughly_centred(self) -> LabelVolume:
+        """Like ``centred``, but a tree within ``CENTRED_WITHIN_MM`` stays where it is."""
+        low, high = self.box_mm()
+        off = float(np.abs(0.5 * (low + high)).max())
+        return self if off <= CENTRED_WITHIN_MM else self.centred()
+
+    def components(self) -> list[LabelVolume]:
+        """Return connected parts (26 neighbours, occupancy above 0), most voluminous first."""
+        labels, count = ndimage.label(self.occupancy > 0, np.ones((3, 3, 3)))
+        mass = ndimage.sum(self.occupancy, labels, np.arange(1, count + 1))
+        parts = []
+        for which in np.argsort(-mass, kind="stable") + 1:
+            part = np.where(labels == which, self.occupancy, np.float32(0))
+            parts.append(dataclasses.replace(self, occupancy=part))
+        return parts
+
+    def left_right(self) -> tuple[LabelVolume, LabelVolume]:
+        """Split into the left and the right coronary tree.
+
+        The two most voluminous connected parts are the two trees; the one whose centre of
+        mass lies further to the patient's left is the left tree. Smaller parts (torn-off
+        branches, crumbs) belong to neither.
+
+        Raises
+        ------
+        UsageError
+            If there are fewer than two parts.
+        """
+        parts = self.components()
+        if len(parts) < 2:
+            raise UsageError(f"{self.name}: one connected part only, no left and right tree")
+        x = [ndimage.center_of_mass(part.occupancy)[0] for part in parts[:2]]
+        left, right = (parts[0], parts[1]) if x[0] > x[1] else (parts[1], parts[0])
+        return left, right
+
+    def on_grid(self, grid: Grid, samples: int = 3) -> Volume:
+        """Area-averaged occupancy on another grid.
+
+        Each voxel is the mean of ``samples``^3 evenly spaced trilinear samples of this
+        volume (zero outside), which is separable: one small matrix per axis. Identical
+        grids are returned unchanged.
+
+        Parameters
+        ----------
+        grid : Grid
+            The voxels wanted.
+        samples : int
+            Samples per voxel edge; raised where a voxel is so coarse that samples would
+            be further apart than this volume's voxels.
+
+        Returns
+        -------
+        (nx, ny, nz) float32 of ``grid.shape``, 0 .. 1
+        """
+        if grid == self.grid:
+            return self.occupancy.astype(np.float32)
+        out: Array = self.occupancy.astype(np.float64)
+        ratio = grid.spacing_mm / self.grid.spacing_mm
+        for axis in range(3):
+            count = max(samples, int(np.ceil(ratio[axis])))
+            weights = _axis_weights(self.grid, grid, axis, count)
+            out = np.moveaxis(np.tensordot(weights, out, axes=(1, axis)), 0, axis)
+        return np.clip(out, 0, 1).astype(np.float32)
+
+    def _on(self, occupancy: Array, lower_mm: Array) -> LabelVolume:
+        size = np.asarray(occupancy.shape) * self.grid.spacing_mm
+        grid = Grid(
+            center_mm=tuple((lower_mm + 0.5 * size).tolist()),
+            size_mm=tuple(size.tolist()),
+            shape=tuple(int(n) for n in occupancy.shape),
+        )
+        return dataclasses.replace(self, occupancy=np.ascontiguousarray(occupancy), grid=grid)
+
+
+#: what a damaged file raises inside NumPy, nibabel, zlib and zipfile
+_DAMAGE = (
+    ValueError, OSError, EOFError, KeyError, MemoryError, OverflowError, ZeroDivisionError,
+    np.linalg.LinAlgError, zlib.error, zipfile.BadZipFile, ImageFileError, HeaderDataError,
+)  # fmt: skip
+
+
+def read_label(path: str | Path) -> LabelVolume:
+    """Read a label volume by its file name: .nii, .nii.gz, .nrrd, .mha, .mhd or ASOCA .npz.
+
+    Any value above 0 is vessel; the ``occupancy`` array of an .npz (uint8, 0 .. 255) keeps
+    its shares. Wide empty borders are cropped.
+
+    Raises
+    ------
+    UsageError
+        If the file is missing, of another kind, or empty.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"no such label volume: {path}")
+    name = path.name.lower()
+    case = path.name.split(".")[0]
+    try:
+        if name.endswith(".npz"):
+            label = _read_npz(path, case)
+        else:
+            array, affine = _read_any(path, name)
+            label = from_array(array > 0, affine, case)
+    except _DAMAGE as error:
+        reason = (str(error).splitlines() or [""])[0].replace(str(path), "it")[:200]
+        raise UsageError(f"{path}: cannot be read ({reason or type(error).__name__})") from None
+    if not label.occupancy.any():
+        raise UsageError(f"{path}: the label volume is empty")
+    low, high = _occupied_box(label.occupancy)
+    share = float(np.prod(high - low + 1)) / label.occupancy.size
+    return label.cropped() if share < CROP_BELOW else label
+
+
+def from_array(occupancy: Array, index2ras: Array, name: str = "label") -> LabelVolume:
+    """Build from an array in any voxel order and its (4, 4) index to mm RAS.
+
+    Axes are permuted and flipped to run along LPS; an oblique volume is resampled
+    (trilinear) at its own finest spacing.
+    """
+    index2lps = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.asarray(index2ras, dtype=np.float64)
+    array = np.asarray(occupancy, dtype=np.float32)
+    if array.ndim != 3:
+        raise UsageError(f"{name}: a label volume has 3 axes, this has {array.ndim}")
+    directions = index2lps[:3, :3]
+    spacing = np.linalg.norm(directions, axis=0)
+    main = np.abs(directions / spacing).argmax(axis=0)
+    off = np.abs(directions / spacing)
+    off[main, np.arange(3)] = 0
+    if sorted(main.tolist()) != [0, 1, 2] or off.max() > OBLIQUE_TOLERANCE:
+        return _resampled(array, index2lps, name)
+    order = np.argsort(main)
+    array = np.transpose(array, order)
+    corner = index2lps[:3, 3].copy()
+    for world_axis, source_axis in enumerate(order):
+        step = directions[world_axis, source_axis]
+        if step < 0:
+            array = np.flip(array, world_axis)
+            corner[world_axis] += step * (array.shape[world_axis] - 1)
+    spacing = spacing[order]
+    size = spacing * array.shape
+    center = corner - 0.5 * spacing + 0.5 * size
+    grid = Grid(
+        center_mm=tuple(center.tolist()),
+        size_mm=tuple(size.tolist()),
+        shape=tuple(int(n) for n in array.shape),
+    )
+    return LabelVolume(occupancy=np.ascontiguousarray(array), grid=grid, name=name)
+
+
+def _read_any(path: Path, name: str) -> tuple[Array, Array]:
+    if name.endswith((".nii", ".nii.gz")):
+        import nibabel
+
+        image = nibabel.load(path)
+        return np.asarray(image.dataobj), np.asarray(image.affine)
+    if name.endswith((".nrrd", ".nhdr")):
+        return read_nrrd(path)
+    if name.endswith((".mha", ".mhd")):
+        return read_metaimage(path)
+    raise UsageError(f"{path}: not a .nii, .nii.gz, .nrrd, .mha, .mhd or .npz label volume")
+
+
+def _read_npz(path: Path, case: str) -> LabelVolume:
+    """ASOCA Normal_1 as released with 3DGR-CAR: axes are x, y, z in LPS, 180 mm cube."""
+    with np.load(path, allow_pickle=False) as archive:
+        if "occupancy" not in archive:
+            raise UsageError(f"{path}: has no array named 'occupancy'")
+        array = archive["occupancy"]
+    if array.ndim != 3:
+        raise UsageError(f"{path}: 'occupancy' must have 3 axes, has {array.ndim}")
+    scale = 255.0 if array.dtype == np.uint8 else 1.0
+    size = tuple(ASOCA_NPZ_SPACING_MM * n for n in array.shape)
+    grid = Grid(center_mm=(0.0, 0.0, 0.0), size_mm=size, shape=tuple(array.shape))
+    occupancy = (array / scale).astype(np.float32)
+    return LabelVolume(occupancy=occupancy, grid=grid, name=f"asoca_{case}")
+
+
+def _resampled(array: Array, index2lps: Array, name: str) -> LabelVolume:
+    occupied = np.argwhere(array > 0)
+    if not len(occupied):
+        raise UsageError(f"{name}: the label volume is empty")
+    step = float(np.linalg.norm(index2lps[:3, :3], axis=0).min())
+    low, high = occupied.min(0) - 1, occupied.max(0) + 1
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    world = (low + corners * (high - low)) @ index2lps[:3, :3].T + index2lps[:3, 3]
+    shape = np.ceil((world.max(0) - world.min(0)) / step).astype(int) + 1
+    center = 0.5 * (world.max(0) + world.min(0))
+    grid = Grid(
+        center_mm=tuple(center.tolist()),
+        size_mm=tuple((shape * step).tolist()),
+        shape=tuple(shape.tolist()),
+    )
+    lps2index = np.linalg.inv(index2lps)
+    matrix = lps2index[:3, :3] * grid.spacing_mm
+    offset = lps2index[:3, :3] @ grid.index2world(np.zeros(3)) + lps2index[:3, 3]
+    out = ndimage.affine_transform(array, matrix, offset, output_shape=grid.shape, order=1)
+    return LabelVolume(occupancy=out, grid=grid, name=name)
+
+
+def _axis_weights(source: Grid, target: Grid, axis: int, samples: int) -> Array:
+    """(n_target, n_source) mean of linear interpolation over the samples of each voxel."""
+    n_source, n_target = source.shape[axis], target.shape[axis]
+    within = (np.arange(samples) + 0.5) / samples - 0.5
+    index = np.arange(n_target)[:, None] + within
+    world = target.lower_mm[axis] + (index + 0.5) * target.spacing_mm[axis]
+    at = (world - source.lower_mm[axis]) / source.spacing_mm[axis] - 0.5
+    weights = np.zeros((n_target, n_source))
+    base = np.floor(at).astype(int)
+    rows = np.broadcast_to(np.arange(n_target)[:, None], base.shape)
+    for step, share in ((0, 1.0 - (at - base)), (1, at - base)):
+        inside = (base + step >= 0) & (base + step < n_source)
+        np.add.at(weights, (rows[inside], base[inside] + step), share[inside] / samples)
+    return weights
+
+
+def _occupied_box(occupancy: Array) -> tuple[Array, Array]:
+    low, high = [], []
+    for axis in range(3):
+        others = tuple(a for a in range(3) if a != axis)
+        hit = np.flatnonzero((occupancy > 0).any(axis=others))
+        if not len(hit):
+            raise UsageError("the label volume is empty")
+        low.append(hit[0])
+        high.append(hit[-1])
+    return np.array(low), np.array(high)

@@ -1,0 +1,1 @@
+"""Shipping: ONNX export with parity, golden cases, verification, documents made by code."""

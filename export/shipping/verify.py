@@ -1,0 +1,40 @@
+"""Verify a model file: its spec, and what it does through the runtime's own predictor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gcar_deploy.models.spec import read_model
+from gcar_deploy.predict.center_predictor import open_predictor
+from gcar_export.shipping.task_check import scores
+
+
+def verify_model(path: Path, scenes: int) -> str:
+    """Run ``scenes`` generated scenes and say how well their vessel is found.
+
+    Raises
+    ------
+    ModelError
+        The file is not what its spec says.
+    """
+    from gcar_deploy.cli.model_card import card
+
+    model = read_model(path)
+    dice: dict[str, list[float]] = {}
+    for kind, score in scores(model, scenes):
+        dice.setdefault(kind, []).append(score)
+    lines = card(model)
+    worst = open_predictor(model, threads=1).check_golden()
+    lines.append(
+        "no golden case beside it"
+        if worst is None
+        else f"golden case: largest difference {worst:.1e}"
+    )
+    lines.append("through the runtime's own predictor, on generated scenes:")
+    lines += [
+        f"  {kind}: Dice at 0.5 on the hull {np.mean(v):.3f} ({len(v)} scenes)"
+        for kind, v in sorted(dice.items())
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Studies: one table or page each."""

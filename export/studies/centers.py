@@ -1,0 +1,98 @@
+"""Predicted centres of one examination, as the runtime finds them, and how good they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.measure.metrics import skeleton
+from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
+from gcar_deploy.predict.decision import decide
+from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.hull import Candidates
+from gcar_deploy.predict.single_view import merge_views
+from gcar_deploy.reconstruct import seen_by_all
+from gcar_deploy.types import Points, Volume
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Posed:
+    """An examination as a predictor meets it, at the angles that it is told.
+
+    Attributes
+    ----------
+    views : vessel images
+    hull, encoded : what the views leave on the lattice
+    """
+
+    views: list[VesselImage]
+    hull: Candidates
+    encoded: Encoded
+
+
+def pose(angiograms: Sequence[Angiogram], grid: Grid) -> Posed:
+    """Find vessels and hull as ``reconstruct`` does, without correcting poses."""
+    options = RunOptions()
+    views = [extract_vessels(a, options.imaging) for a in angiograms]
+    hull, known = seen_by_all(views, grid, options)
+    return Posed(views, hull, encode(hull, known))
+
+
+def predicted(predictor: Predictor, posed: Posed) -> dict[str, Points]:
+    """Predicted centres, (n, 3) mm LPS each, by the name of their row.
+
+    ``multi``: hull points decided to be vessel, moved by their offset to the centreline.
+    ``single``: likewise, merged from single views; ``single, each view``: what each view says
+    on its own, lifted along its rays.
+    """
+    options = RunOptions()
+    if isinstance(predictor, SingleViewPredictor):
+        alone = predictor.predict([(v.carm, v.path_mm) for v in posed.views])
+        merged = merge_views(
+            alone, posed.hull, posed.encoded, options.candidates, options.predict.single
+        )
+        return {
+            "single": merged.points_mm[merged.confidence >= 0.5],
+            "single, each view": np.concatenate([view.points_mm for view in alone]),
+        }
+    error = max(view.path_error for view in posed.views)
+    found = decide(
+        predictor.predict(posed.hull, posed.encoded), posed.encoded, error, options.decide
+    )
+    offset = 0.0 if found.offset_mm is None else found.offset_mm
+    return {"multi": (found.points_mm + offset)[found.confidence >= 0.5]}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Truth:
+    """True vessel voxels and centreline of a volume, mm LPS."""
+
+    vessel: Points
+    centerline: Points
+
+    @staticmethod
+    def of(volume: Volume, grid: Grid) -> Truth:
+        """Take the voxels at least half full, and their skeleton."""
+        mask = volume >= 0.5
+        line = skeleton(mask, grid.spacing_mm)
+        return Truth(grid.index2world(np.argwhere(mask)), grid.index2world(line.index))
+
+    @functools.cached_property
+    def _vessel_tree(self) -> cKDTree:
+        return cKDTree(self.vessel)
+
+    def scores(self, centers: Points, reach_mm: float) -> tuple[float, float]:
+        """Share of centres near the vessel, and of the centreline near a centre; NaN without."""
+        if not len(centers) or not len(self.centerline):
+            return float("nan"), 0.0 if len(self.centerline) else float("nan")
+        precision = (self._vessel_tree.query(centers)[0] <= reach_mm).mean()
+        recall = (cKDTree(centers).query(self.centerline)[0] <= reach_mm).mean()
+        return float(precision), float(recall)

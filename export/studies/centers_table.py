@@ -1,0 +1,204 @@
+"""Predicted centres on real trees: how good they are, and what a prediction costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcar_deploy.errors import UsageError
+from gcar_deploy.models.spec import SHIPPED, read_model, shipped_model_path
+from gcar_deploy.predict.center_map import net_picture
+from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor, open_predictor
+from gcar_deploy.predict.encoding import flat_inputs
+from gcar_deploy.types import Array
+from gcar_export.evaluate.evaluate import find_labels
+from gcar_export.evaluate.protocols import Case, make_case
+from gcar_export.methods.predictor_process import peak_mib
+from gcar_export.methods.rtk_timing import pair_carms, projection_pair
+from gcar_export.scenes.labels import read_label
+from gcar_export.studies.centers import Posed, Truth, pose, predicted
+
+#: how near counts, voxels of the protocol's grid (1.41 mm paper, 1 mm clinical)
+REACH_VOXELS = 1.5
+ORDER = ("multi", "single", "single, each view")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One predictor on one tree: shares of centres and of centreline, 0 .. 1."""
+
+    case: str
+    name: str
+    precision: float
+    recall: float
+    centers: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """What both views of one case cost.
+
+    Attributes
+    ----------
+    name : multi or single
+    pairs : inference over one itk-rtk forward and back projection (128^3 voxels, two 128 x 128
+        views), wall-clock
+    cpu_pairs : the same of processor seconds, which other load on the machine hardly touches
+    seconds, pair_seconds : medians of timings taken in turns in this process
+    peak_mib : peak memory of a process that only runs the predictor
+    """
+
+    name: str
+    pairs: float
+    cpu_pairs: float
+    seconds: float
+    pair_seconds: float
+    peak_mib: float
+
+
+def open_models(names: Sequence[str]) -> list[tuple[Path, Predictor]]:
+    """Open shipped models by kind (``multi``, ``single``) or any by path.
+
+    Raises
+    ------
+    UsageError
+        A kind has no shipped model.
+    ModelError
+        A file is missing or altered.
+    """
+    out = []
+    for name in names:
+        path = shipped_model_path(SHIPPED[name]) if name in SHIPPED else Path(name)
+        if path is None:
+            raise UsageError(f"no {name} model is installed; give the path of one")
+        out.append((path, open_predictor(read_model(path))))
+    return out
+
+
+def measure(
+    data: Path,
+    protocol: str,
+    models: Sequence[tuple[Path, Predictor]],
+    cases: Sequence[str] = (),
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[Row]:
+    """Predict every tree of ``data`` with every model."""
+    files = [f for f in find_labels(data) if not cases or f.name.split(".")[0] in cases]
+    if not files:
+        raise UsageError(f"{data}: none of the cases {', '.join(cases)} is there")
+    rows: list[Row] = []
+    for done, file in enumerate(files):
+        case = make_case(read_label(file), protocol)
+        posed, truth = pose(case.angiograms(), case.grid), Truth.of(case.truth, case.grid)
+        reach = REACH_VOXELS * float(np.mean(case.grid.spacing_mm))
+        for _, predictor in models:
+            for name, centers in predicted(predictor, posed).items():
+                precision, recall = truth.scores(centers, reach)
+                rows.append(Row(case.name, name, precision, recall, len(centers)))
+        if progress:
+            progress(done + 1, len(files), case.name)
+    return rows
+
+
+def cost(
+    data: Path,
+    protocol: str,
+    models: Sequence[tuple[Path, Predictor]],
+    cases: Sequence[str] = (),
+    repeats: int = 7,
+) -> list[Cost]:
+    """Time inference and projections in turns on the first case; measure memory."""
+    files = [f for f in find_labels(data) if not cases or f.name.split(".")[0] in cases]
+    case = make_case(read_label(files[0]), protocol)
+    posed = pose(case.angiograms(), case.grid)
+    work = {"pair": _pair(case)}
+    for _, predictor in models:
+        work[predictor.model.kind] = _inference(predictor, posed)
+    wall: dict[str, list[float]] = {name: [] for name in work}
+    cpu: dict[str, list[float]] = {name: [] for name in work}
+    for round_ in range(repeats + 1):
+        for name, run in work.items():
+            start, begun = time.perf_counter(), time.process_time()
+            run()
+            if round_:
+                wall[name].append(time.perf_counter() - start)
+                cpu[name].append(time.process_time() - begun)
+    seconds, processor = (
+        {name: statistics.median(values) for name, values in of.items()} for of in (wall, cpu)
+    )
+    return [
+        Cost(
+            name=p.model.kind,
+            pairs=seconds[p.model.kind] / seconds["pair"],
+            cpu_pairs=processor[p.model.kind] / processor["pair"],
+            seconds=seconds[p.model.kind],
+            pair_seconds=seconds["pair"],
+            peak_mib=peak_mib(path, _feed(p, posed)),
+        )
+        for path, p in models
+    ]
+
+
+def _pair(case: Case) -> Callable[[], None]:
+    forward, back = projection_pair(case.truth, case.grid, pair_carms())
+
+    def run() -> None:
+        forward()
+        back()
+
+    return run
+
+
+def _inference(predictor: Predictor, posed: Posed) -> Callable[[], Any]:
+    if isinstance(predictor, SingleViewPredictor):
+        views = [(view.carm, view.path_mm) for view in posed.views]
+        return lambda: predictor.predict(views)
+    return lambda: predictor.predict(posed.hull, posed.encoded)
+
+
+def _feed(predictor: Predictor, posed: Posed) -> dict[str, Array]:
+    """Return one inference's inputs by name; of the first view for a single-view model."""
+    if isinstance(predictor, SingleViewPredictor):
+        carm, path = posed.views[0].carm, posed.views[0].path_mm
+        picture = net_picture(carm, path, int(predictor.model.inputs["pixels"]))
+        arrays = [picture.network_input(), picture.axes_input()]
+        return dict(zip(predictor.input_names(), arrays, strict=False))
+    return dict(zip(predictor.input_names(), flat_inputs(posed.encoded), strict=True))
+
+
+def table(rows: Sequence[Row], costs: Sequence[Cost], protocol: str) -> str:
+    """Markdown: mean and SD over trees, the lowest and highest, then the cost."""
+    out = [
+        f"| {protocol}: predictor | centres near the vessel % | centreline near a centre % "
+        "| lowest .. highest | centres |",
+        "|---|---|---|---|---|",
+    ]
+    for name in [n for n in ORDER if any(r.name == n for r in rows)]:
+        own = [r for r in rows if r.name == name]
+        p, r = (100 * np.array([getattr(x, k) for x in own]) for k in ("precision", "recall"))
+        spread = 1 if len(own) > 1 else 0
+        out.append(
+            f"| {name} (n={len(own)}) | {p.mean():.1f} ± {p.std(ddof=spread):.1f} "
+            f"| {r.mean():.1f} ± {r.std(ddof=spread):.1f} "
+            f"| {p.min():.1f} .. {p.max():.1f} / {r.min():.1f} .. {r.max():.1f} "
+            f"| {np.mean([x.centers for x in own]):.0f} |"
+        )
+    if costs:
+        out += [
+            "",
+            "| inference of both views | itk-rtk pairs | pairs of CPU time | s | one pair, s "
+            "| peak memory MiB |",
+            "|---|---|---|---|---|---|",
+        ]
+        out += [
+            f"| {c.name} | {c.pairs:.2f} | {c.cpu_pairs:.2f} | {c.seconds:.3f} "
+            f"| {c.pair_seconds:.3f} | {c.peak_mib:.0f} |"
+            for c in costs
+        ]
+    return "\n".join(out)

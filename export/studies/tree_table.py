@@ -1,0 +1,112 @@
+"""Are generated trees like real ones? Their numbers side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from gcar_deploy.config import CandidateOptions
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.measure.metrics import skeleton
+from gcar_deploy.predict.hull import visual_hull
+from gcar_export.evaluate.protocols import make_case
+from gcar_export.scenes.labels import from_array, read_label
+from gcar_export.scenes.render import occupancy
+from gcar_export.scenes.trees import random_tree
+
+#: voxel of the lattice on which both kinds are measured, mm
+VOXEL_MM = 0.7
+ROWS = (
+    ("volume_mm3", "vessel volume, mm^3"),
+    ("length_mm", "centreline length, mm"),
+    ("radius_mm", "median radius, mm"),
+    ("radius_10_mm", "10 % radius, mm"),
+    ("radius_90_mm", "90 % radius, mm"),
+    ("ends", "ends"),
+    ("box_mm", "longest edge of the box, mm"),
+    ("candidates", "hull cells per vessel cell (0/90 deg, 1.4 mm)"),
+)
+
+
+def statistics(occupied: np.ndarray, affine_ras: np.ndarray, spacing_mm: float) -> dict[str, float]:
+    """Measure one tree.
+
+    Parameters
+    ----------
+    occupied : (nx, ny, nz) bool
+    affine_ras : (4, 4) index to mm RAS
+    spacing_mm : edge of the cubic voxels, mm
+    """
+    line = skeleton(occupied, (spacing_mm,) * 3)
+    index = np.rint(line.points_mm / spacing_mm).astype(int)
+    mask = np.zeros_like(occupied)
+    mask[tuple(index.T)] = True
+    inside = ndimage.distance_transform_edt(occupied) * spacing_mm
+    radius = inside[mask]
+    around = ndimage.convolve(mask.astype(np.int8), np.ones((3, 3, 3), np.int8), mode="constant")
+    label = from_array(occupied, affine_ras, "tree")
+    case = make_case(label, "paper", 2)
+    views = [(a.carm, a.pixels * np.float32(a.intensity.mm_per_count)) for a in case.angiograms()]
+    hull = visual_hull(views, case.grid, CandidateOptions())
+    where = np.argwhere(occupied)
+    return {
+        "volume_mm3": float(occupied.sum() * spacing_mm**3),
+        # A 26-connected line of n voxels is about 1.3 n voxels long.
+        "length_mm": float(1.3 * mask.sum() * spacing_mm),
+        "radius_mm": float(np.median(radius)),
+        "radius_10_mm": float(np.percentile(radius, 10)),
+        "radius_90_mm": float(np.percentile(radius, 90)),
+        "ends": float((mask & (around == 2)).sum()),
+        "box_mm": float(np.ptp(where, axis=0).max() * spacing_mm),
+        "candidates": float(len(hull) / max(int((case.truth >= 0.5).sum()), 1)),
+    }
+
+
+def generated_statistics(seed: int) -> dict[str, float]:
+    """Voxelise one generated tree and measure it."""
+    starts, ends, radii = random_tree(np.random.default_rng(seed)).segments()
+    half = float(np.abs(np.concatenate([starts, ends])).max()) + 4.0
+    n = int(2 * half / VOXEL_MM)
+    grid = Grid(center_mm=(0, 0, 0), size_mm=(n * VOXEL_MM,) * 3, shape=(n,) * 3)
+    index = np.argwhere(ndimage.binary_dilation(_near(starts, ends, grid), iterations=6))
+    share, _, _ = occupancy(grid.index2world(index), VOXEL_MM, starts, ends, radii, sub=2)
+    occupied = np.zeros(grid.shape, bool)
+    occupied[tuple(index.T)] = share >= 0.5
+    return statistics(occupied, grid.affine_ras(), VOXEL_MM)
+
+
+def _near(starts: np.ndarray, ends: np.ndarray, grid: Grid) -> np.ndarray:
+    """Voxels that the centrelines pass through."""
+    out = np.zeros(grid.shape, bool)
+    for t in np.linspace(0, 1, 4):
+        index = np.rint(grid.world2index(starts + t * (ends - starts))).astype(int)
+        out[tuple(np.clip(index, 0, np.array(grid.shape) - 1).T)] = True
+    return out
+
+
+def real_statistics(path: Path) -> dict[str, float]:
+    """Resample one label volume to the common voxel and measure it."""
+    label = read_label(path)
+    spacing = np.asarray(label.grid.spacing_mm)
+    shape = np.maximum(np.round(spacing * label.grid.shape / VOXEL_MM), 1).astype(int)
+    grid = Grid(
+        center_mm=tuple(label.grid.center_mm),
+        size_mm=tuple((shape * VOXEL_MM).tolist()),
+        shape=tuple(shape.tolist()),
+    )
+    occupied = label.on_grid(grid) >= 0.5
+    return statistics(occupied, grid.affine_ras(), VOXEL_MM)
+
+
+def table(generated: list[dict[str, float]], real: list[dict[str, float]]) -> str:
+    """Markdown: mean (lowest .. highest) of each figure for both kinds."""
+    out = [f"| | generated ({len(generated)}) | real ({len(real)}) |", "|---|---|---|"]
+    for key, name in ROWS:
+        cells = []
+        for rows in (generated, real):
+            v = [r[key] for r in rows]
+            cells.append(f"{np.mean(v):.4g} ({min(v):.4g} .. {max(v):.4g})" if v else "-")
+        out.append(f"| {name} | {cells[0]} | {cells[1]} |")
+    return "\n".join(out)

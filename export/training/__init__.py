@@ -1,0 +1,1 @@
+"""Training: networks, data sets, losses, resumable runs."""

@@ -1,0 +1,289 @@
+"""Train the multi-view centre predictor on generated trees, in pieces of any length.
+
+Scene i is a function of (seed, i), the learning rate one of the step: a run that was stopped goes
+on to the bit (see ``run_folder``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import torch
+import torch.distributed
+import torch.multiprocessing
+
+from gcar_export.training.dataset import LabelTree, SceneOptions, TrainingScene, training_scene
+from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
+from gcar_export.training.run_folder import ProgressLine, RunFolder
+
+#: scenes with this seed are for choosing and reporting, never for training
+VALIDATION_SEED = 90_001
+GENERATED = "generated trees alone (gcar_export.scenes.trees)"
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """Optimiser settings; the schedule is warm-up, constant, then linear to zero."""
+
+    seed: int = 1
+    steps: int = 5_250
+    decay_steps: int = 3_250
+    replicas: int = 2
+    warmup_steps: int = 200
+    learning_rate: float = 1.5e-3
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    validation_scenes: int = 24
+    save_every: int = 500
+    device: str = "cpu"
+    #: forward pass in bfloat16; the loss stays in float32
+    bf16: bool = False
+    compiled: bool = False
+
+
+PRESETS = {
+    "cpu": TrainOptions(),
+    "gpu": TrainOptions(
+        steps=120_000, decay_steps=30_000, replicas=1, device="cuda", bf16=True, compiled=True
+    ),
+    "tiny": TrainOptions(
+        replicas=1, steps=4, decay_steps=2, warmup_steps=1, validation_scenes=2, save_every=2
+    ),
+}
+
+CONFIGS = {
+    "cpu": SparseConfig(),
+    "gpu": SparseConfig(),
+    "tiny": SparseConfig(width=(3, 2, 2, 2), stages=1, ray_width=1),
+}
+
+
+def learning_rate(options: TrainOptions, step: int) -> float:
+    """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
+    up = min(1.0, (step + 1) / options.warmup_steps)
+    down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
+    return options.learning_rate * up * down
+
+
+def inputs(scene: TrainingScene, device: str = "cpu") -> tuple:
+    """Return the network's arguments for one scene as tensors."""
+    e = scene.encoded
+
+    def t(a: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(a).to(device)
+
+    return (
+        t(e.features),
+        t(e.ray),
+        t(e.ray_path),
+        t(e.weight),
+        [t(x) for x in e.neighbours],
+        [t(x) for x in e.parent],
+    )
+
+
+def scene_loss(outputs: list[torch.Tensor], scene: TrainingScene) -> torch.Tensor:
+    """Cross-entropy and soft Dice of every stage's occupancy; offset and radius of the last."""
+    truth = torch.from_numpy(scene.occupancy).to(outputs[0].device)
+    total = outputs[0].new_zeros(())
+    for k, out in enumerate(outputs):
+        logit = out[:, 0]
+        p = torch.sigmoid(logit)
+        bce = torch.nn.functional.binary_cross_entropy_with_logits(logit, truth)
+        dice = 1 - (2 * (p * truth).sum() + 1) / ((p * p).sum() + (truth * truth).sum() + 1)
+        total = total + (0.4 if k < len(outputs) - 1 else 1.0) * (bce + 0.5 * dice)
+    radius = torch.from_numpy(scene.radius_cells).to(truth.device)
+    near = (truth > 0.1) & (radius > 0)
+    if bool(near.any()):
+        last, radius = outputs[-1][near], radius[near]
+        offset = torch.from_numpy(scene.offset_cells).to(truth.device)[near]
+        smooth = torch.nn.functional.smooth_l1_loss
+        total = total + 0.15 * smooth(last[:, 1:4], offset, beta=0.5)
+        total = total + 0.15 * smooth(last[:, 4], radius, beta=0.25)
+    return total
+
+
+@torch.no_grad()
+def validate(net: SparsePredictor, scenes: list[TrainingScene]) -> dict[str, dict[str, float]]:
+    """Dice at 0.5, and precision and recall within 1.5 cells, per kind of scene."""
+    from scipy.spatial import cKDTree
+
+    net.eval()
+    device = str(next(net.parameters()).device)
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for scene in scenes:
+        p = torch.sigmoid(net(*inputs(scene, device))[-1][:, 0]).cpu().numpy()
+        chosen, truth = p >= 0.5, scene.occupancy >= 0.5
+        dice = 2 * (chosen & truth).sum() / max(chosen.sum() + truth.sum(), 1)
+        reach = 1.5 * scene.spacing_mm
+        precision = recall = 0.0
+        if chosen.any() and truth.any():
+            a, b = cKDTree(scene.points_mm[chosen]), cKDTree(scene.points_mm[truth])
+            precision = (b.query(scene.points_mm[chosen])[0] <= reach).mean()
+            recall = (a.query(scene.points_mm[truth])[0] <= reach).mean()
+        rows.setdefault(scene.kind, []).append((dice, precision, recall))
+    net.train()
+    return {
+        kind: dict(zip(("dice", "precision", "recall"), np.mean(v, axis=0).tolist(), strict=True))
+        for kind, v in sorted(rows.items())
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """What every replica needs to know."""
+
+    out: Path
+    options: TrainOptions
+    config: SparseConfig
+    until: float | None
+    labels: tuple[LabelTree, ...]
+    label_hashes: Mapping[str, str]
+    port: int = 0
+
+
+def train(
+    out: Path,
+    options: TrainOptions,
+    config: SparseConfig | None = None,
+    *,
+    until: float | None = None,
+    labels: Sequence[LabelTree] = (),
+    label_hashes: Mapping[str, str] | None = None,
+) -> None:
+    """Train or go on training in ``out``; stop after ``until`` seconds if given.
+
+    Each step takes one scene per replica; replicas are processes of one thread each, which
+    uses cores better than threads do on scenes of this size, and their gradients are averaged.
+
+    Raises
+    ------
+    UsageError
+        ``out`` holds a run of another network, size, seed or set of labels.
+    """
+    job = _Job(
+        out, options, config or SparseConfig(), until, tuple(labels), dict(label_hashes or {})
+    )
+    _run_folder(job)
+    if options.replicas == 1:
+        _replica(0, job)
+        return
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        job = dataclasses.replace(job, port=probe.getsockname()[1])
+    torch.multiprocessing.spawn(_replica, args=(job,), nprocs=options.replicas, join=True)
+
+
+def _replica(rank: int, job: _Job) -> None:
+    options, scenes = job.options, SceneOptions()
+    torch.set_num_threads(1 if options.replicas > 1 else torch.get_num_threads())
+    if options.replicas > 1:
+        torch.distributed.init_process_group(
+            "gloo",
+            init_method=f"tcp://127.0.0.1:{job.port}",
+            rank=rank,
+            world_size=options.replicas,
+        )
+    run = _run_folder(job)
+    torch.manual_seed(options.seed)
+    net = SparsePredictor(job.config).to(options.device).train()
+    optimiser = torch.optim.AdamW(
+        net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
+    )
+    step = run.resume(net, optimiser)
+    held_out = []
+    if rank == 0:
+        held_out = [
+            training_scene(VALIDATION_SEED, i, scenes) for i in range(options.validation_scenes)
+        ]
+    # Every scene has another number of points: shapes stay symbols in the compiled graph.
+    forward = torch.compile(net, dynamic=True) if options.compiled else net
+    line = ProgressLine(step, options.steps, options.replicas, "scenes")
+    began, losses = time.monotonic(), []
+    while step < options.steps:
+        out_of_time = job.until is not None and time.monotonic() - began > job.until
+        if _any(out_of_time, options.replicas):
+            break
+        scene = training_scene(options.seed, step * options.replicas + rank, scenes, job.labels)
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(options, step)
+        with _precision(options):
+            outputs = forward(*inputs(scene, options.device))
+        loss = scene_loss([o.float() for o in outputs], scene)
+        optimiser.zero_grad()
+        loss.backward()
+        _average(net, options.replicas)
+        norm = torch.nn.utils.clip_grad_norm_(net.parameters(), options.clip)
+        if bool(torch.isfinite(norm)):
+            optimiser.step()
+        losses.append(float(loss.detach()))
+        step += 1
+        if rank == 0:
+            line.show(step, losses)
+        if rank == 0 and (step % options.save_every == 0 or step == options.steps):
+            scores = validate(net, held_out)
+            run.save(net, optimiser, step, {"validation": scores})
+            run.log(step, float(np.mean(losses[-250:])), scores)
+            _tell(step, scores)
+    if rank == 0:
+        run.save(net, optimiser, step)
+    if options.replicas > 1:
+        torch.distributed.destroy_process_group()
+
+
+def _run_folder(job: _Job) -> RunFolder:
+    return RunFolder(
+        job.out,
+        {
+            "network": "sparse",
+            "config": dataclasses.asdict(job.config),
+            "seed": job.options.seed,
+            "options": dataclasses.asdict(job.options),
+            "scenes": dataclasses.asdict(SceneOptions()),
+            "labels": dict(job.label_hashes),
+            "data": f"{'generated trees and label volumes' if job.labels else GENERATED}: "
+            "scene step * replicas + rank of the seed",
+            "validation_seed": VALIDATION_SEED,
+        },
+    )
+
+
+def _precision(options: TrainOptions) -> contextlib.AbstractContextManager[Any]:
+    kind = torch.device(options.device).type
+    return torch.autocast(kind, torch.bfloat16, enabled=options.bf16)
+
+
+def _tell(step: int, scores: Mapping[str, Mapping[str, float]]) -> None:
+    shown = "  ".join(
+        f"{k}: dice {v['dice']:.3f} p {v['precision']:.3f} r {v['recall']:.3f}"
+        for k, v in scores.items()
+    )
+    click.echo(f"step {step}  {shown}", err=True)
+
+
+def _any(flag: bool, replicas: int) -> bool:
+    if replicas == 1:
+        return flag
+    shared = torch.tensor(float(flag))
+    torch.distributed.all_reduce(shared)
+    return bool(shared > 0)
+
+
+def _average(net, replicas: int) -> None:
+    if replicas == 1:
+        return
+    flat = torch.cat([p.grad.reshape(-1) for p in net.parameters()])
+    torch.distributed.all_reduce(flat)
+    flat /= replicas
+    at = 0
+    for p in net.parameters():
+        p.grad.copy_(flat[at : at + p.numel()].view_as(p))
+        at += p.numel()

@@ -1,0 +1,296 @@
+"""Train the paper's single-view centre predictor, in pieces of any length.
+
+Pictures of step k are a function of (seed, k), the learning rate and the Chamfer weight of the
+step: a run that was stopped goes on to the bit (see ``run_folder``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import torch
+
+from gcar_deploy.predict.center_map import DEPTH_PIXELS, decode
+from gcar_export.training import losses
+from gcar_export.training.dataset import LabelTree, SceneOptions
+from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
+from gcar_export.training.run_folder import ProgressLine, RunFolder
+from gcar_export.training.single_dataset import VIEWS, TrainingPicture, training_pictures
+
+#: trees with this seed are for choosing and reporting, never for training
+VALIDATION_SEED = 90_002
+#: half of the picture's field is one unit of length in Chamfer and clDice
+_UNIT_PIXELS = 64.0
+
+
+@dataclasses.dataclass(frozen=True)
+class SingleOptions:
+    """Optimiser settings; the rate warms up, stays, then falls linearly to zero."""
+
+    seed: int = 1
+    steps: int = 1_600
+    decay_steps: int = 800
+    trees: int = 4
+    warmup_steps: int = 100
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    clip: float = 10.0
+    #: see ``losses.chamfer_weight``; the paper's 20,000 scaled to the length of the run
+    chamfer_schedule: str = "clamp"
+    chamfer_start: int = 1_000
+    #: clDice on a cube of so many voxels, of so many of a step's pictures
+    cldice_voxels: int = 32
+    cldice_pictures: int = 1
+    cldice_iterations: int = 1
+    validation_trees: int = 20
+    save_every: int = 100
+    device: str = "cpu"
+    #: forward pass in bfloat16; losses stay in float32
+    bf16: bool = False
+    compiled: bool = False
+
+
+PRESETS = {
+    "cpu": SingleOptions(),
+    "gpu": SingleOptions(
+        steps=100_000, decay_steps=40_000, trees=16, chamfer_start=losses.PAPER_START,
+        cldice_voxels=128, cldice_pictures=8, cldice_iterations=4, save_every=2_000,
+        device="cuda", bf16=True, compiled=True,
+    ),
+    "tiny": SingleOptions(
+        steps=4, decay_steps=2, trees=1, warmup_steps=1, chamfer_start=1, cldice_voxels=16,
+        validation_trees=1, save_every=2,
+    ),
+}  # fmt: skip
+CONFIGS = {
+    "cpu": UNetConfig(width=(8, 16, 32, 64, 128, 160), pose=True),
+    "gpu": UNetConfig(width=(16, 32, 64, 96, 128, 160), pose=True),
+    "tiny": UNetConfig(pixels=64, alpha=4, width=(4, 4)),
+}
+
+
+def learning_rate(options: SingleOptions, step: int) -> float:
+    """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
+    up = min(1.0, (step + 1) / options.warmup_steps)
+    down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
+    return options.learning_rate * up * down
+
+
+@dataclasses.dataclass(eq=False)
+class Batch:
+    """Pictures of one step as tensors; ``b`` pictures of n x n pixels and m x m cells.
+
+    Attributes
+    ----------
+    pictures : (b, 1, n, n); depth, known, cells : (b, m, m); rays : (b, m, m, 3)
+        Rays in the axes of each view (column, row, source to detector).
+    middle : (b,) distance of source and isocentre, and source : (b, 3), both in units of 64 pixels
+    centerline : per picture (k, 3), units of 64 pixels, axes of the view
+    axes : (b, 3, 3) axes of the views, rows
+    """
+
+    pictures: torch.Tensor
+    depth: torch.Tensor
+    known: torch.Tensor
+    cells: torch.Tensor
+    rays: torch.Tensor
+    source: torch.Tensor
+    centerline: list[torch.Tensor]
+    axes: torch.Tensor
+
+    @staticmethod
+    def of(drawn: Sequence[TrainingPicture], alpha: int, device: str) -> Batch:
+        """Stack pictures and their truth."""
+
+        def stack(arrays: Sequence[Any], kind: Any = np.float32) -> torch.Tensor:
+            return torch.from_numpy(np.stack([np.asarray(a, kind) for a in arrays])).to(device)
+
+        axes = [p.picture.carm.axes for p in drawn]
+        units = [_UNIT_PIXELS * p.picture.pixel_mm for p in drawn]
+        return Batch(
+            pictures=stack([p.picture.network_input()[0] for p in drawn]),
+            depth=stack([p.depth for p in drawn]),
+            known=stack([p.known for p in drawn], bool),
+            cells=stack([p.picture.cells(alpha) for p in drawn], bool),
+            rays=stack([p.picture.rays(alpha) @ a.T for p, a in zip(drawn, axes, strict=True)]),
+            source=stack([a @ p.picture.carm.source_mm / u for p, a, u in zip(drawn, axes, units)]),  # noqa: B905
+            centerline=[
+                torch.from_numpy((p.centerline_mm @ a.T / u).astype(np.float32)).to(device)
+                for p, a, u in zip(drawn, axes, units, strict=True)
+            ],
+            axes=stack(axes),
+        )
+
+    def centers(self, out: torch.Tensor, k: int) -> torch.Tensor:
+        """(n, 3) centres of picture ``k``, differentiable twin of ``center_map.decode``."""
+        inside = self.cells[k]
+        t = self.source[k].norm() + (out[k, 0][inside] - 0.5) * (DEPTH_PIXELS / _UNIT_PIXELS)
+        offset = out[k, 1:, inside].T / _UNIT_PIXELS
+        return self.source[k] + t[:, None] * self.rays[k][inside] + offset
+
+
+def batch_loss(
+    out: torch.Tensor, batch: Batch, step: int, options: SingleOptions
+) -> tuple[torch.Tensor, dict[str, int]]:
+    """Mean over pictures of the paper's loss; and how many pictures each term had to leave out."""
+    gamma1 = losses.chamfer_weight(step, options.chamfer_start, options.chamfer_schedule)
+    left_out = {"depth": 0, "chamfer": 0}
+    total = out.new_zeros(())
+    n = len(out)
+    for k in range(n):
+        depth = losses.depth_loss(out[k, 0], batch.depth[k], batch.known[k])
+        if depth is None:
+            left_out["depth"] += 1
+        else:
+            total = total + losses.GAMMA_DEPTH * losses.DEPTH_SCALE * depth / n
+        if gamma1 > 0:
+            distance = losses.chamfer(batch.centers(out, k), batch.centerline[k])
+            if distance is None:
+                left_out["chamfer"] += 1
+            else:
+                total = total + gamma1 * distance / n
+    # Far from the truth skeletons never meet and their slope is noise: like Chamfer, clDice waits
+    # for the end of the warm-up. It costs more than all the rest, so a few pictures stand for all.
+    wanted = min(options.cldice_pictures, n) if gamma1 > 0 else 0
+    chosen = [(step + j) % n for j in range(wanted)]
+    for k in chosen:
+        made = losses.splat(batch.centers(out, k), options.cldice_voxels)
+        true = losses.splat(batch.centerline[k], options.cldice_voxels)
+        overlap = losses.skeleton_dice_loss(made, true, options.cldice_iterations)
+        total = total + losses.GAMMA_CLDICE * overlap / len(chosen)
+    return total, left_out
+
+
+@torch.no_grad()
+def validate(
+    net: UNetPredictor, pictures: Sequence[TrainingPicture]
+) -> dict[str, dict[str, float]]:
+    """Per kind: share of centres within 1.5 pixels of the centreline and back; depth error.
+
+    The centreline counted for recall is the part inside the picture; the depth error is the
+    median absolute one, in pixel edges.
+    """
+    from scipy.spatial import cKDTree
+
+    net.eval()
+    device = next(net.parameters()).device
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for p in pictures:
+        seen = Batch.of([p], net.config.alpha, device)
+        out = net(seen.pictures, seen.axes)[0].float().cpu().numpy()
+        centers = decode(out, p.picture, net.config.alpha).points_mm
+        reach = 1.5 * p.picture.pixel_mm
+        precision = (cKDTree(p.centerline_mm).query(centers)[0] <= reach).mean()
+        recall = (cKDTree(centers).query(p.centerline_mm)[0] <= reach).mean()
+        wrong = np.median(np.abs(out[0] - p.depth)[p.known]) * DEPTH_PIXELS
+        rows.setdefault(p.kind, []).append((float(precision), float(recall), float(wrong)))
+    net.train()
+    names = ("precision", "recall", "depth_error")
+    return {
+        kind: dict(zip(names, np.mean(v, axis=0).tolist(), strict=True))
+        for kind, v in sorted(rows.items())
+    }
+
+
+def train(
+    out: Path,
+    options: SingleOptions,
+    config: UNetConfig,
+    *,
+    until: float | None = None,
+    labels: Sequence[LabelTree] = (),
+    label_hashes: Mapping[str, str] | None = None,
+) -> None:
+    """Train or go on training in ``out``; stop after ``until`` seconds if given.
+
+    Raises
+    ------
+    UsageError
+        ``out`` holds a run of another network, size, seed or set of labels.
+    """
+    scenes = SceneOptions()
+    run = RunFolder(out, _manifest(options, config, scenes, label_hashes or {}))
+    torch.manual_seed(options.seed)
+    net = UNetPredictor(config).to(options.device, memory_format=torch.channels_last).train()
+    optimiser = torch.optim.AdamW(
+        net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
+    )
+    step = run.resume(net, optimiser)
+    held_out = [
+        p
+        for i in range(options.validation_trees)
+        for p in training_pictures(VALIDATION_SEED, i, config, scenes)
+    ]
+    forward = torch.compile(net) if options.compiled else net
+    line = ProgressLine(step, options.steps, options.trees * VIEWS, "pictures")
+    began, recent, skipped = time.monotonic(), [], 0
+    while step < options.steps:
+        if until is not None and time.monotonic() - began > until:
+            break
+        drawn = [
+            p
+            for j in range(options.trees)
+            for p in training_pictures(
+                options.seed, step * options.trees + j, config, scenes, labels
+            )
+        ]
+        batch = Batch.of(drawn, config.alpha, options.device)
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(options, step)
+        with _precision(options):
+            picture = batch.pictures.contiguous(memory_format=torch.channels_last)
+            answer = forward(picture, batch.axes)
+        loss, _ = batch_loss(answer.float(), batch, step, options)
+        optimiser.zero_grad()
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(net.parameters(), options.clip)
+        if bool(torch.isfinite(norm)):
+            optimiser.step()
+        else:
+            skipped += 1
+        recent.append(float(loss.detach()))
+        step += 1
+        line.show(step, recent)
+        if step % options.save_every == 0 or step == options.steps:
+            scores = validate(net, held_out)
+            run.save(net, optimiser, step, {"validation": scores, "skipped_steps": skipped})
+            run.log(step, float(np.mean(recent[-250:])), scores)
+            error = float(np.mean([s["depth_error"] for s in scores.values()]))
+            run.keep_best(step, error, scores)
+            _tell(step, scores)
+    run.save(net, optimiser, step)
+
+
+def _precision(options: SingleOptions) -> contextlib.AbstractContextManager[Any]:
+    kind = torch.device(options.device).type
+    return torch.autocast(kind, torch.bfloat16, enabled=options.bf16)
+
+
+def _manifest(options, config, scenes, label_hashes) -> dict[str, Any]:
+    return {
+        "network": "unet",
+        "config": dataclasses.asdict(config),
+        "seed": options.seed,
+        "options": dataclasses.asdict(options),
+        "scenes": dataclasses.asdict(scenes),
+        "labels": dict(label_hashes),
+        "data": "generated trees (gcar_export.scenes.trees): tree step * trees + j of the seed"
+        if not label_hashes
+        else "generated trees (gcar_export.scenes.trees) and label volumes",
+        "validation_seed": VALIDATION_SEED,
+    }
+
+
+def _tell(step: int, scores: Mapping[str, Mapping[str, float]]) -> None:
+    shown = "  ".join(
+        f"{kind}: p {s['precision']:.3f} r {s['recall']:.3f} depth {s['depth_error']:.1f} px"
+        for kind, s in scores.items()
+    )
+    click.echo(f"step {step}  {shown}", err=True)

@@ -1,0 +1,73 @@
+"""Start a training by name: which network, which preset, which of users' own label volumes."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from gcar_deploy.errors import UsageError
+from gcar_export.training.dataset import LabelTree
+
+NETWORKS = ("multi", "single")
+
+
+def start(
+    out: Path,
+    network: str,
+    preset: str,
+    *,
+    steps: int | None = None,
+    decay_steps: int | None = None,
+    minutes: float | None = None,
+    labels: Path | None = None,
+) -> None:
+    """Train ``network`` with a preset, some of its numbers replaced.
+
+    Parameters
+    ----------
+    out : folder of the run; a run that is there goes on
+    network : ``multi`` or ``single``
+    preset : ``cpu``, ``gpu`` or ``tiny``
+    steps, decay_steps : replace the preset's
+    minutes : stop after so long
+    labels : folder of label volumes (NIfTI, NRRD, MetaImage) that half of the scenes show
+
+    Raises
+    ------
+    UsageError
+        No CUDA device for ``gpu``; unreadable labels; ``out`` holds another run.
+    """
+    from gcar_export.training import multi as train_multi
+    from gcar_export.training import single as train_single
+
+    if network not in NETWORKS:
+        raise UsageError(f"network {network!r} is none of {', '.join(NETWORKS)}")
+    trees: list[LabelTree] = []
+    hashes: dict[str, str] = {}
+    if labels is not None:
+        from gcar_export.scenes.label_trees import read_label_trees
+
+        trees, hashes = read_label_trees(labels)
+    changes = {k: v for k, v in (("steps", steps), ("decay_steps", decay_steps)) if v}
+    until = minutes * 60 if minutes else None
+    if network == "multi":
+        options = dataclasses.replace(train_multi.PRESETS[preset], **changes)
+        _check_device(options.device)
+        train_multi.train(
+            out, options, train_multi.CONFIGS[preset], until=until, labels=trees,
+            label_hashes=hashes,
+        )  # fmt: skip
+    else:
+        single = dataclasses.replace(train_single.PRESETS[preset], **changes)
+        _check_device(single.device)
+        train_single.train(
+            out, single, train_single.CONFIGS[preset], until=until, labels=trees,
+            label_hashes=hashes,
+        )  # fmt: skip
+
+
+def _check_device(device: str) -> None:
+    import torch
+
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError("preset gpu needs a CUDA device, and torch finds none; use cpu")

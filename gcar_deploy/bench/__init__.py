@@ -1,0 +1,1 @@
+"""Speed against error, and seconds per stage."""

@@ -1,0 +1,91 @@
+"""Which view to take next: the direction that would lower the centreline's uncertainty most."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.observability import curve_sigmas
+from gcar_deploy.measure.lumen import foreshortening
+from gcar_deploy.tree.tree import Tree
+
+#: directions that are looked at, degrees; not both angles large at once: within the ellipse
+PRIMARY_DEG = tuple(range(-60, 61, 10))
+SECONDARY_DEG = tuple(range(-40, 41, 10))
+ELLIPSE_DEG = (65.0, 45.0)
+#: points of the tree that are looked at
+MOST_POINTS = 150
+#: an unbounded uncertainty counts as this, mm
+WORST_MM = 5.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FurtherView:
+    """A direction worth taking.
+
+    Attributes
+    ----------
+    primary_angle_deg, secondary_angle_deg : float
+    name : clinical words, for instance ``'LAO 10 CRA 40'``
+    sigma_before_mm, sigma_after_mm : mean bound across the vessel for 1 px of noise, without and
+        with that view
+    foreshortening : share of the tree's length that it hides
+    """
+
+    primary_angle_deg: float
+    secondary_angle_deg: float
+    name: str
+    sigma_before_mm: float
+    sigma_after_mm: float
+    foreshortening: float
+
+
+def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
+    """Search the directions a C-arm reaches, in steps of 10 degrees.
+
+    The measure is the mean Cramer-Rao bound across the vessel (``curve_sigmas``), which counts
+    what is foreshortened by itself; None for a tree without a branch.
+    """
+    if not tree.branches:
+        return None
+    points = tree.points()
+    tangents = np.concatenate([branch.tangents for branch in tree.branches])
+    keep = np.unique(np.linspace(0, len(points) - 1, MOST_POINTS).astype(int))
+    points, tangents = points[keep], tangents[keep]
+    model = carms[0]
+
+    def mean_sigma(views: Sequence[CArm]) -> float:
+        return float(np.minimum(curve_sigmas(views, points, tangents), WORST_MM).mean())
+
+    best, least = None, np.inf
+    for primary, secondary in itertools.product(PRIMARY_DEG, SECONDARY_DEG):
+        if np.hypot(primary / ELLIPSE_DEG[0], secondary / ELLIPSE_DEG[1]) > 1:
+            continue
+        carm = CArm(
+            primary_angle_deg=primary,
+            secondary_angle_deg=secondary,
+            sod_mm=model.sod_mm,
+            sdd_mm=model.sdd_mm,
+            rows=model.rows,
+            columns=model.columns,
+            pixel_spacing_mm=model.pixel_spacing_mm,
+        )
+        sigma = mean_sigma([*carms, carm])
+        if sigma < least:
+            best, least = carm, sigma
+    if best is None:
+        return None
+    lengths = [branch.length_mm for branch in tree.branches]
+    hidden = [foreshortening(branch, best) for branch in tree.branches]
+    return FurtherView(
+        primary_angle_deg=best.primary_angle_deg,
+        secondary_angle_deg=best.secondary_angle_deg,
+        name=best.clinical_name(),
+        sigma_before_mm=mean_sigma(carms),
+        sigma_after_mm=least,
+        foreshortening=float(np.average(hidden, weights=np.maximum(lengths, 1e-9))),
+    )

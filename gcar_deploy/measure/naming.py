@@ -1,0 +1,289 @@
+"""Names of the main vessels, LM, LAD, LCx and RCA, each with a probability.
+
+A *reading* of a component says which free end is the ostium and which ways are the named vessels:
+``left`` (the common trunk of two ways is LM, their rest LAD and LCx) or ``right`` (one way, RCA).
+Each reading is measured by a few figures of anatomy: directions in patient coordinates (the
+anterior interventricular branch runs to the apex, forward, down and to the left; the circumflex
+back round the left ventricle; the right coronary artery first to the right, then down and back),
+lengths and calibres. Its score falls with the distance from what is usual,
+
+    score = bias_side - 0.5 sum_i weight_i min(((figure_i - mean_i) / sd_i)^2, 16).
+
+Readings that break a rule of anatomy (``RULES``) are left out. A softmax over the others and the
+reading "none of these" (score 0) gives probabilities; a branch has the probability of all readings
+that give it a name. Means, spreads and weights are in ``naming.json``, fitted by
+``gcar_export.studies.naming_fit`` to generated trees, to mirrored and turned ones and parts of
+them, which have no right reading, and to a dozen real ones named by the same rules of anatomy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Mapping
+from importlib import resources
+
+import numpy as np
+
+from gcar_deploy.measure.routes import MOST_ROOTS, Route, end_radii, routes_from
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Array, Scalars
+
+#: a branch is named from this probability on
+LEAST_CONFIDENCE = 0.8
+#: figures further off than this many spreads count no more
+_MOST_SPREADS = 4.0
+#: ways shorter than this are no main vessel; trunks longer than this are no LM, mm
+LEAST_WAY_MM, MOST_TRUNK_MM = 25.0, 45.0
+#: branches beyond the end of the RCA (posterior descending, posterolateral) at most
+_MOST_LAST = 2
+#: directions near a bifurcation are taken over so much, mm
+_NEAR_MM = 20.0
+#: the two sides: names of the figures of a reading
+_XYZ = ("left", "back", "up")
+LEFT_FIGURES = (
+    *(f"lad end {d}" for d in _XYZ), *(f"lcx end {d}" for d in _XYZ),
+    *(f"lad begin {d}" for d in _XYZ), *(f"lcx begin {d}" for d in _XYZ),
+    *(f"trunk {d}" for d in _XYZ),
+    "trunk length", "lad of longest", "lcx of longest", "trunk calibre", "lad to lcx calibre",
+    "ostium calibre", "lad straight", "lcx straight", "beyond lad", "beyond lcx", "share",
+    "lad lower",
+)  # fmt: skip
+RIGHT_FIGURES = (
+    *(f"part {k} {d}" for k in (1, 2, 3, 4) for d in _XYZ),
+    "length", "straight", "ostium calibre", "calibre", "share", "largest side way",
+)  # fmt: skip
+#: rules without which there is no such reading, whatever the rest says: figure to (least, most).
+#: The LAD ends at the apex, in front and at least 10 mm lower than the LCx, which sets out to the
+#: back; the LM leaves the aorta to the left. The RCA sets out to the right, goes down, turns back
+#: to the left along the diaphragm, and gives off nothing nearly as long as itself.
+_LEFT_RULES = {
+    "lad lower": (0.5, np.inf), "trunk left": (0.2, np.inf), "lad end up": (-np.inf, -0.2),
+    "lad end back": (-np.inf, 0.1), "lcx begin back": (0.1, np.inf),
+}  # fmt: skip
+_RIGHT_RULES = {
+    "part 1 left": (-np.inf, 0.2), "part 2 left": (-np.inf, 0.3), "part 2 up": (-np.inf, 0.0),
+    "part 3 up": (-np.inf, 0.3), "part 4 left": (0.0, np.inf), "part 4 back": (0.0, np.inf),
+    "largest side way": (-np.inf, 0.9),
+}  # fmt: skip
+RULES = {
+    side: np.array([rules.get(name, (-np.inf, np.inf)) for name in figures]).T
+    for side, figures, rules in (
+        ("left", LEFT_FIGURES, _LEFT_RULES), ("right", RIGHT_FIGURES, _RIGHT_RULES),
+    )
+}  # fmt: skip
+_PARTS = np.array([0.0, 0.15, 0.4, 0.7, 1.0])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BranchName:
+    """Name of a branch (LM, LAD, LCx, RCA) and the probability that it is right, 0 .. 1."""
+
+    name: str
+    confidence: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reading:
+    """One way to read a component: side, name of each named branch, figures."""
+
+    side: str
+    names: dict[int, str]
+    figures: Scalars
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Template:
+    """What is usual on one side: (k,) means, spreads and weights of the figures, and a bias."""
+
+    mean: Scalars
+    sd: Scalars
+    weight: Scalars
+    bias: float
+
+    def scores(self, figures: Array) -> Scalars:
+        """(n,) score of (n, k) figures."""
+        z2 = np.minimum(((figures - self.mean) / self.sd) ** 2, _MOST_SPREADS**2)
+        out: Scalars = self.bias - 0.5 * z2 @ self.weight
+        return out
+
+
+def name_branches(
+    tree: Tree, least: float = LEAST_CONFIDENCE, usual: Mapping[str, Template] | None = None
+) -> tuple[BranchName | None, ...]:
+    """Name what can be named of a tree.
+
+    Parameters
+    ----------
+    tree : Tree, mm LPS; its place does not matter, its directions do
+    least : probability from which on a branch is named
+    usual : what is usual on each side; None takes that of the package
+
+    Returns
+    -------
+    per branch its name, or None
+    """
+    out: list[BranchName | None] = [None] * len(tree.branches)
+    if not tree.branches:
+        return ()
+    component = tree.components()
+    of_branch = np.array([component[branch.start] for branch in tree.branches])
+    for k in range(int(component.max()) + 1):
+        own = np.flatnonzero(of_branch == k)
+        for number, chances in _chances(tree, own, usual or templates()).items():
+            name = max(chances, key=lambda n: chances[n])
+            if chances[name] >= least:
+                out[number] = BranchName(name=name, confidence=chances[name])
+    return _contradictions_dropped(tree, out)
+
+
+def readings(tree: Tree, own: Array) -> list[Reading]:
+    """All readings of the component with the branches ``own``."""
+    radii = end_radii(tree)
+    mine = {n for k in own for n in (tree.branches[k].start, tree.branches[k].end)}
+    ends = sorted((n for n in radii if n in mine), key=lambda n: (-radii[n], n))
+    whole = sum(tree.branches[k].length_mm for k in own)
+    out: list[Reading] = []
+    for root in ends[:MOST_ROOTS]:
+        ways = [w for w in routes_from(tree, root) if w.length_mm >= LEAST_WAY_MM]
+        calibre = float(np.log(radii[root] / radii[ends[0]]))
+        # A lone line has no side branch to be told by.
+        if len(own) > 2:
+            out += [_right(way, ways, calibre, whole) for way in _beginnings(ways)]
+        out += [
+            reading
+            for a in ways
+            for c in ways
+            if a is not c and (reading := _left(a, c, ways, calibre, whole)) is not None
+        ]
+    return [reading for reading in out if possible(reading.side, reading.figures)]
+
+
+def possible(side: str, figures: Scalars) -> bool:
+    """Whether a reading keeps the rules of its side."""
+    low, high = RULES[side]
+    return bool(((figures >= low) & (figures <= high)).all())
+
+
+def probabilities(found: list[Reading], usual: Mapping[str, Template]) -> Scalars:
+    """(n,) probability of each reading; what is missing to 1 is that of none."""
+    scores = np.zeros(len(found) + 1)
+    for side, template in usual.items():
+        which = [k for k, reading in enumerate(found) if reading.side == side]
+        if which:
+            scores[which] = template.scores(np.stack([found[k].figures for k in which]))
+    scores -= scores.max()
+    share = np.exp(scores)
+    out: Scalars = share[:-1] / share.sum()
+    return out
+
+
+@functools.cache
+def templates() -> dict[str, Template]:
+    """Return what is usual, by side."""
+    text = resources.files("gcar_deploy.measure").joinpath("naming.json").read_text("utf-8")
+    out = {}
+    for side, told in json.loads(text)["sides"].items():
+        rows = np.array([[row["mean"], row["sd"], row["weight"]] for row in told["figures"]])
+        out[side] = Template(rows[:, 0], rows[:, 1], rows[:, 2], float(told["bias"]))
+    return out
+
+
+def _chances(tree: Tree, own: Array, usual: Mapping[str, Template]) -> dict[int, dict[str, float]]:
+    """Branch to the probability of each name that some reading gives it."""
+    found = readings(tree, own)
+    out: dict[int, dict[str, float]] = {}
+    for reading, share in zip(found, probabilities(found, usual), strict=True):
+        for branch, name in reading.names.items():
+            chances = out.setdefault(branch, {})
+            chances[name] = chances.get(name, 0.0) + float(share)
+    return out
+
+
+def _beginnings(ways: list[Route]) -> list[Route]:
+    """Ways, also without their last branches: the RCA ends where it gives off its last ones."""
+    found: dict[tuple[int, ...], Route] = {}
+    for way in ways:
+        for count in range(max(len(way.branches) - _MOST_LAST, 1), len(way.branches) + 1):
+            if way.node_arc_mm[count] >= LEAST_WAY_MM:
+                found.setdefault(way.branches[:count], way.until(count))
+    return [found[key] for key in sorted(found)]
+
+
+def _left(a: Route, c: Route, ways: list[Route], calibre: float, whole: float) -> Reading | None:
+    """Read two ways as LAD and LCx with their common trunk; None where they have none."""
+    shared = _shared(a, c)
+    trunk = a.node_arc_mm[shared]
+    lad, lcx = a.length_mm - trunk, c.length_mm - trunk
+    if not shared or trunk > MOST_TRUNK_MM or min(lad, lcx) < LEAST_WAY_MM:
+        return None
+    names = dict.fromkeys(a.branches[:shared], "LM")
+    names |= dict.fromkeys(a.branches[shared:], "LAD")
+    names |= dict.fromkeys(c.branches[shared:], "LCx")
+    fork, ostium = a.at(np.array(trunk)), a.points_mm[0]
+    near_a, near_c = (way.at(np.array(trunk + _NEAR_MM)) for way in (a, c))
+    r_trunk = a.mean_radius(0.0, trunk)
+    r_lad, r_lcx = (way.mean_radius(trunk, trunk + _NEAR_MM) for way in (a, c))
+    ends = np.array([way.points_mm[-1] for way in ways])
+    # How much further than these ends other vessels reach: forward and down, and back.
+    to_apex, to_back = ends @ np.array([0.0, -0.7, -0.7]), ends[:, 1]
+    longest = max(way.length_mm for way in ways)
+    own_a = a.points_mm[-1] @ np.array([0.0, -0.7, -0.7])
+    figures = [
+        *_unit(a.points_mm[-1] - fork), *_unit(c.points_mm[-1] - fork),
+        *_unit(near_a - fork), *_unit(near_c - fork), *_unit(fork - ostium),
+        np.log(max(trunk, 1.0)), np.log(a.length_mm / longest), np.log(c.length_mm / longest),
+        np.log(2 * r_trunk / (r_lad + r_lcx)), np.log(r_lad / r_lcx), calibre,
+        np.linalg.norm(a.points_mm[-1] - fork) / lad, np.linalg.norm(c.points_mm[-1] - fork) / lcx,
+        (to_apex.max() - own_a) / 20.0, (to_back.max() - c.points_mm[-1, 1]) / 20.0,
+        (trunk + lad + lcx) / whole, (c.points_mm[-1, 2] - a.points_mm[-1, 2]) / 20.0,
+    ]  # fmt: skip
+    return Reading("left", names, np.array(figures))
+
+
+def _shared(a: Route, b: Route) -> int:
+    """Count the branches that two ways from one ostium begin with together."""
+    shared = 0
+    while shared < min(len(a.branches), len(b.branches)) and (
+        a.branches[shared] == b.branches[shared]
+    ):
+        shared += 1
+    return shared
+
+
+def _right(way: Route, ways: list[Route], calibre: float, whole: float) -> Reading:
+    """Read one way as RCA."""
+    off = [other.length_mm - other.node_arc_mm[_shared(way, other)] for other in ways]
+    length = way.length_mm
+    places = way.at(_PARTS * length)
+    figures = [
+        *np.concatenate([_unit(step) for step in np.diff(places, axis=0)]),
+        np.log(length), np.linalg.norm(places[-1] - places[0]) / length, calibre,
+        np.log(way.mean_radius(0.5 * length, length) / way.mean_radius(0.0, 0.5 * length)),
+        length / whole, max(off) / length,
+    ]  # fmt: skip
+    return Reading("right", dict.fromkeys(way.branches, "RCA"), np.array(figures))
+
+
+def _contradictions_dropped(
+    tree: Tree, names: list[BranchName | None]
+) -> tuple[BranchName | None, ...]:
+    """No names at all where a left tree would stand to the right of a right one."""
+    middle = {}
+    for side, of_side in (("left", ("LAD", "LCx")), ("right", ("RCA",))):
+        points = [
+            branch.points_mm[:, 0]
+            for branch, name in zip(tree.branches, names, strict=True)
+            if name is not None and name.name in of_side
+        ]
+        if points:
+            middle[side] = float(np.concatenate(points).mean())
+    if len(middle) == 2 and middle["left"] <= middle["right"]:
+        return (None,) * len(names)
+    return tuple(names)
+
+
+def _unit(way: Array) -> Array:
+    out: Array = way / max(float(np.linalg.norm(way)), 1e-9)
+    return out

@@ -1,0 +1,1 @@
+"""Models: read, guarded and checked before anything of them runs."""

@@ -1,0 +1,246 @@
+"""Agreement of the views along the epipolar lines: as told, moved, in parts, in the other order.
+
+First what is measured, before there is any tree; then what follows for the status.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from gcar_deploy.config import QualityOptions, RunOptions
+from gcar_deploy.errors import RefusedError
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.parts import largest_part
+from gcar_deploy.imaging.resample import sampled_path
+from gcar_deploy.pose.landmarks import landmark_pixels
+from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
+
+_log = logging.getLogger(__name__)
+
+
+def agreeing(
+    angiograms: Sequence[Angiogram], views: Sequence[VesselImage], options: RunOptions
+) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
+    """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
+
+    First from what the network alone sees, where the classical method followed lines that have no
+    counterpart; then from the largest part of each.
+
+    What was taken for vessel in one picture's background stands apart from the tree as a rule and
+    has no counterpart in the other picture. Parts of a mask that the user gave are never dropped.
+
+    Returns
+    -------
+    views : as given, what the network alone sees of them, or their largest connected parts
+    poses : one per view
+    findings : that parts were left out, which makes the result ``degraded``
+    """
+    limits = options.quality
+    views, poses = _alone_if_closer(views, options)
+    worst = max(p.after for p in poses)
+    if all(v.calibrated for v in views) or worst <= limits.parts_disagreement_raw:
+        return list(views), poses, []
+    main = [
+        view if view.calibrated or angiogram.mask is not None else largest_part(view)
+        for angiogram, view in zip(angiograms, views, strict=True)
+    ]
+    if all(a is b for a, b in zip(main, views, strict=True)):
+        return list(views), poses, []
+    closer = poses_between(main, options)
+    if max(p.after for p in closer) > limits.good_disagreement_raw:
+        return list(views), poses, []
+    findings = [
+        f"view {one.view_id}: {1 - one.mask.sum() / view.mask.sum():.0%} of what looks like vessel "
+        "stands apart and has no counterpart in the other views: left out as background"
+        for one, view in zip(main, views, strict=True)
+        if one is not view
+    ]
+    return main, closer, findings
+
+
+def _alone_if_closer(
+    views: Sequence[VesselImage], options: RunOptions
+) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:
+    poses = poses_between(views, options)
+    worst = max(p.after for p in poses)
+    limits = options.quality
+    if worst <= limits.alone_disagreement_raw or all(view.alone is None for view in views):
+        return views, poses
+    alone = [view if view.alone is None else view.alone for view in views]
+    closer = poses_between(alone, options)
+    if limits.alone_ratio * max(p.after for p in closer) >= worst:
+        return views, poses
+    _log.info("the views agree better by what the network alone sees")
+    return alone, closer
+
+
+def poses_between(
+    views: Sequence[VesselImage], options: RunOptions, known: Sequence[Pose] | None = None
+) -> tuple[Pose, ...]:
+    """Estimate the correction of every view against the first from their vessel profiles.
+
+    With ``known`` corrections nothing is estimated, only what the profiles say of them.
+    """
+    # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
+    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    calibrated = [view.calibrated for view in views]
+    finest = max(pixel, options.predict.min_cell_mm) if all(calibrated) else 0.75 * pixel
+    pose = dataclasses.replace(
+        options.pose,
+        fine_mm=max(options.pose.fine_mm, finest),
+        coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
+    )
+    small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
+    marks = landmark_pixels(options.landmarks, [view.carm for view in views])
+    for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
+        scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
+        marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
+    if known is not None:
+        return judged_poses(known, small, pose, marks, calibrated)
+    return estimate_poses(small, pose, marks, calibrated)
+
+
+def other_order(views: Sequence[VesselImage], options: RunOptions) -> float | None:
+    """Compare two views whose pictures change places, without any correction.
+
+    Returns
+    -------
+    disagreement of the pictures with each other's geometry as it is told, 0 .. 1; None of three
+    and more views, and where the pictures' sizes differ: these cannot have been swapped
+    """
+    if len(views) != 2 or views[0].mask.shape != views[1].mask.shape:
+        return None
+    asked = dataclasses.replace(
+        options, pose=dataclasses.replace(options.pose, enabled=False), landmarks=()
+    )
+    first, second = views
+    swapped = (
+        dataclasses.replace(first, carm=second.carm),
+        dataclasses.replace(second, carm=first.carm),
+    )
+    return poses_between(swapped, asked)[1].after
+
+
+def order_of(
+    views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
+) -> tuple[list[str], str]:
+    """Judge whether two views' pictures may be swapped; see ``check_order``."""
+    if len(views) != 2:
+        return [], ""
+    first, second = views
+    calibrated, given = first.calibrated and second.calibrated, poses[1].after
+    if calibrated and given <= disagreement_limits(calibrated, options.quality)[0]:
+        return [], ""  # nothing to be asked, and no time spent on it
+    ids, other = (first.view_id, second.view_id), other_order(views, options)
+    return check_order(ids, given, other, calibrated, options.quality)
+
+
+def disagreement_limits(calibrated: bool, options: QualityOptions) -> tuple[float, float]:
+    """Disagreement above which views are doubted, and above which they are refused."""
+    if calibrated:
+        return options.good_disagreement, options.max_disagreement
+    return options.good_disagreement_raw, options.max_disagreement_raw
+
+
+def check_consistency(
+    views: Sequence[VesselImage],
+    disagreement: Sequence[float],
+    options: QualityOptions,
+    partners: Sequence[int] | None = None,
+) -> list[str]:
+    """Judge whether the views can show one tree.
+
+    Parameters
+    ----------
+    views : V vessel images
+    disagreement : (V,) of each view's epipolar profile with its partner's, 0 .. 1
+    partners : (V,) which view each was compared with; the first where left out
+
+    Raises
+    ------
+    RefusedError
+        The views contradict each other.
+    """
+    findings = []
+    for k, (view, value) in enumerate(zip(views, disagreement, strict=True)):
+        other = views[partners[k] if partners else 0]
+        calibrated = other.calibrated and view.calibrated
+        findings += check_agreement((other.view_id, view.view_id), value, calibrated, options)
+    return findings
+
+
+def check_agreement(
+    view_ids: tuple[str, str], disagreement: float, calibrated: bool, options: QualityOptions
+) -> list[str]:
+    """Judge the disagreement of two views, 0 .. 1; returns and raises as ``check_consistency``."""
+    first, second = view_ids
+    good, most = disagreement_limits(calibrated, options)
+    if disagreement > most:
+        raise RefusedError(
+            f"views {first} and {second} contradict each other: the vessels "
+            f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
+            "different patients, frames or angles?"
+        )
+    if disagreement > (good if calibrated else min(good, options.sure_disagreement_raw)):
+        return [
+            f"view {second} agrees poorly with view {first}: {disagreement:.0%} of "
+            "the vessel differs along the epipolar lines"
+        ]
+    return []
+
+
+def check_order(
+    view_ids: tuple[str, str],
+    disagreement: float,
+    other_order: float | None,
+    calibrated: bool,
+    options: QualityOptions,
+) -> tuple[list[str], str]:
+    """Judge whether two pictures could have been given in the wrong order.
+
+    Parameters
+    ----------
+    view_ids : of both views
+    disagreement : of the pictures as they were given, corrected, 0 .. 1
+    other_order : with each other's geometry as it is told; None where they cannot be swapped
+    calibrated : whether both pictures are
+
+    Returns
+    -------
+    findings : that make the result ``degraded``
+    hint : what a refusal should say as well; empty where the pictures need not be swapped
+    """
+    good, _ = disagreement_limits(calibrated, options)
+    # Opposite views are not compared, which leaves 0.
+    if other_order is None or disagreement <= (good if calibrated else 0.0):
+        return [], ""
+    first, second = view_ids
+    instead = (
+        f"the other way round ({other_order:.0%} of the vessels differ, not {disagreement:.0%})"
+    )
+    if other_order <= min(good, options.swapped_ratio * disagreement):
+        hint = f"views {first} and {second} agree far better {instead}: are the pictures swapped?"
+        return [hint], hint
+    if other_order <= options.order_ratio * disagreement:
+        return [
+            f"views {first} and {second} agree about as well {instead}: the pictures do not tell "
+            "whether they are swapped"
+        ], ""
+    return [], ""
+
+
+@contextlib.contextmanager
+def with_hint(hint: str) -> Iterator[None]:
+    """Let a refusal say as well what may be the reason; an empty hint adds nothing."""
+    try:
+        yield
+    except RefusedError as error:
+        if not hint:
+            raise
+        end = "" if str(error).endswith("?") else "."
+        raise RefusedError(f"{error}{end} {hint[0].upper()}{hint[1:]}") from None

@@ -1,0 +1,73 @@
+"""Three or more views that do not agree as they are told: their poses from the tree they show."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.pose.bundle_adjustment import adjust
+from gcar_deploy.pose.landmarks import landmark_pixels
+from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.tree.tree import Tree
+
+#: a view that moves by less than this between rounds has arrived, mm
+ARRIVED_MM = 0.5
+
+
+def bundled(
+    views: Sequence[VesselImage],
+    poses: Sequence[Pose],
+    tree_of: Callable[[Sequence[VesselImage]], Tree],
+    options: RunOptions,
+) -> tuple[Pose, ...]:
+    """Fit tree and poses to each other in turn.
+
+    Parameters
+    ----------
+    views : V vessel images as they are told
+    poses : their corrections by mass profiles (``refine.pose``)
+    tree_of : makes a tree of views that have their corrections built in
+    options : RunOptions
+
+    Returns
+    -------
+    V poses: as given with fewer than three views, where no view had to be moved, where all
+    pictures are calibrated (their profiles place them more exactly than lines do), or where the
+    adjustment does not bring the tree clearly nearer to the pictures
+    """
+    o = options.bundle
+    told = [view.carm for view in views]
+    poses = tuple(poses)
+    if len(views) < 3 or not options.pose.enabled or all(view.calibrated for view in views):
+        return poses
+    if not any(pose.theta.any() for pose in poses):
+        return poses
+    marks = landmark_pixels(options.landmarks, told)
+    for _ in range(o.rounds):
+        theta = np.stack([pose.theta for pose in poses])
+        tree = tree_of([posed(view, pose) for view, pose in zip(views, poses, strict=True)])
+        found = adjust(tree, views, told, theta, o, marks)
+        near_mm = o.least_px * max(carm.pixel_at_isocenter_mm for carm in told)
+        if found.before_mm < near_mm or found.after_mm >= o.min_gain * found.before_mm:
+            break
+        poses = tuple(_at(pose, t) for pose, t in zip(poses, found.theta, strict=True))
+        if np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM:
+            break
+    return poses
+
+
+def posed(view: VesselImage, pose: Pose) -> VesselImage:
+    """Return the view with its correction built in."""
+    carm = pose.applied(view.carm)
+    return view if carm is view.carm else dataclasses.replace(view, carm=carm)
+
+
+def _at(pose: Pose, theta: np.ndarray) -> Pose:
+    x, y, z, primary, secondary = (float(value) for value in theta)
+    return dataclasses.replace(
+        pose, offset_mm=(x, y, z), primary_deg=primary, secondary_deg=secondary
+    )

@@ -1,0 +1,197 @@
+"""Pose of three or more views at once, from the epipolar consistency of every pair.
+
+One pair sees a shift along the normal of its own epipolar planes alone. A third view that does
+not lie in the plane of the first two has another normal with each of them, so what is hidden
+from one pair is seen by the next: all pairs together form one least-squares problem, in which
+only directions that no pair sees are left to the prior.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize
+
+from gcar_deploy.config import PoseOptions
+from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
+from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
+from gcar_deploy.pose.profile_fit import fit_profiles, prior_root, prior_sigmas
+from gcar_deploy.types import Array, Scalars
+
+
+def corrected(carm: CArm, theta: Array) -> CArm:
+    """Return the view after ``theta``: offset x, y, z in mm, primary and secondary in degrees."""
+    if not theta.any():
+        return carm
+    if theta[3] or theta[4]:
+        carm = carm.turned(float(theta[3]), float(theta[4]))
+    return carm.moved(theta[:3])
+
+
+def estimate_jointly(
+    masses: Sequence[Mass | None], first: Array, options: PoseOptions, marks: Array
+) -> Array:
+    """Estimate the corrections of all views but the first from all pairs.
+
+    Parameters
+    ----------
+    masses : V views, as they are told
+    first : (V, 5) corrections found pair by pair, the first of them zero: one of the starts
+    options : PoseOptions
+    marks : (m, V, 2) landmarks, (col, row), nan where not seen
+
+    Returns
+    -------
+    (V, 5) corrections; ``first`` where fewer than three pairs can be compared, where there are
+    more views than ``joint_most_views`` (the cost grows with their cube), where all pairs agree as
+    they are told, or where all pairs together do not agree better after the joint fit
+    """
+    seen = {k: mass for k, mass in enumerate(masses) if mass is not None}
+    problem = _Problem(seen, options, marks)
+    if len(problem.pairs) < 3 or len(seen) > options.joint_most_views:
+        return first
+    if not first.any() and max(problem.disagreements(first)) <= options.agreed:
+        return first
+    theta = problem.fitted(problem.shifts(first))
+    if problem.mean_disagreement(theta) >= problem.mean_disagreement(first):
+        return first
+    return problem.without_the_needless(theta)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Problem:
+    """All pairs that can be compared, and the priors; ``seen`` are the views with vessels."""
+
+    seen: dict[int, Mass]
+    options: PoseOptions
+    marks: Array
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs with vessels whose planes cut slices: neither nearly parallel nor opposite."""
+        out = []
+        for i, j in itertools.combinations(self.seen, 2):
+            apart = separation_deg(self.seen[i].carm, self.seen[j].carm)
+            if self.options.least_apart_deg <= apart <= self.options.most_apart_deg:
+                out.append((i, j))
+        return out
+
+    @property
+    def prior(self) -> Array:
+        return prior_sigmas(self.options)
+
+    def pair(self, i: int, j: int, theta: Array) -> tuple[Mass, Mass, CArm]:
+        """Both views with the correction of the first built in, and the second's C-arm."""
+        a, b = self.seen[i], self.seen[j]
+        fixed = dataclasses.replace(a, carm=corrected(a.carm, theta[i]))
+        return fixed, b, corrected(b.carm, theta[j])
+
+    def differences(self, i: int, j: int, theta: Array, sigma_mm: float) -> Scalars:
+        """Profile of one view minus that of the other, as shares of its norm."""
+        fixed, moving, carm = self.pair(i, j, theta)
+        a, b = mass_profiles(fixed, moving, carm, sigma_mm)
+        out: Scalars = (a - b) / np.sqrt(float(a @ a))
+        return out
+
+    def residuals(self, x: Array, sigma_mm: float, noise: float) -> Scalars:
+        """All differences, landmark gaps and corrections over their standard deviations."""
+        theta = _with_first(x)
+        parts = [
+            prior_root(self.seen[k].carm, self.options) @ t if k in self.seen else t / self.prior
+            for k, t in enumerate(theta[1:], start=1)
+        ]
+        for i, j in self.pairs:
+            parts.append(self.differences(i, j, theta, sigma_mm) / noise)
+            seen = self.marks[np.isfinite(self.marks[:, [i, j]]).all(axis=(1, 2))]
+            if len(seen):
+                fixed, _, carm = self.pair(i, j, theta)
+                gaps = ray_gaps(fixed.carm, carm, seen[:, i], seen[:, j])
+                parts.append(gaps / self.options.landmark_sigma_mm)
+        return np.concatenate(parts)
+
+    def left(self, x: Array, sigma_mm: float) -> float:
+        """Root mean square mismatch over the pairs."""
+        theta = _with_first(x)
+        values = [mismatch(*self.pair(*p, theta), sigma_mm) for p in self.pairs]
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    def disagreements(self, theta: Array, view: int | None = None) -> list[float]:
+        """Of every pair, or of those of one view, 0 (equal) .. 1 (disjoint)."""
+        pairs = [p for p in self.pairs if view is None or view in p]
+        return [disagreement(*self.pair(*p, theta), self.options.fine_mm) for p in pairs]
+
+    def mean_disagreement(self, theta: Array, view: int | None = None) -> float:
+        """Mean over the pairs, or over those of one view."""
+        values = self.disagreements(theta, view)
+        return float(np.mean(values)) if values else 0.0
+
+    def shifts(self, first: Array) -> Array:
+        """(V, 5) start: offsets that suit all pairs best, angles zero.
+
+        A shift moves a pair's profiles against each other by its share along the pair's normal.
+        So each pair is asked once for its misfit at every such shift, and the offsets are sought
+        on those curves, from many starts: profiles that are far off have many local minima.
+        """
+        o = self.options
+        steps = np.arange(-2 * o.search_mm, 2 * o.search_mm + 1e-9, o.step_mm)
+        zero, curves = np.zeros_like(first), []
+        for i, j in self.pairs:
+            fixed, moving, _ = self.pair(i, j, zero)
+            normal = plane_normal(fixed.carm, moving.carm)
+            misfit = []
+            for step in steps:
+                at = zero.copy()
+                at[j, :3] = step * normal
+                apart = self.differences(i, j, at, o.coarse_mm) / o.profile_noise
+                misfit.append(float(np.sum(apart**2)))
+            curves.append((i, j, normal, CubicSpline(steps, misfit, bc_type="clamped")))
+
+        def cost(x: Array) -> tuple[float, Array]:
+            d = np.vstack([np.zeros(3), x.reshape(-1, 3)])
+            value = float(np.sum((d / o.offset_sigma_mm) ** 2))
+            slope = 2.0 * d / o.offset_sigma_mm**2
+            for i, j, normal, curve in curves:
+                along = float(np.clip(normal @ (d[j] - d[i]), steps[0], steps[-1]))
+                value += float(curve(along))
+                pull = float(curve(along, 1)) * normal
+                slope[j] += pull
+                slope[i] -= pull
+            return value, slope[1:].ravel()
+
+        rng = np.random.default_rng(0)
+        spread = rng.normal(0.0, 2.0 * o.offset_sigma_mm, (o.joint_starts, 3 * (len(first) - 1)))
+        starts = [first[1:, :3].ravel(), np.zeros(3 * (len(first) - 1)), *spread]
+        found = [minimize(cost, s, jac=True, method="L-BFGS-B") for s in starts]
+        out = zero.copy()
+        out[1:, :3] = min(found, key=lambda f: float(f.fun)).x.reshape(-1, 3)
+        return out
+
+    def fitted(self, theta: Array) -> Array:
+        """(V, 5) offsets and angles together, from coarse to fine profiles."""
+        prior = np.tile(self.prior, len(theta) - 1)
+        calibrated = all(mass.calibrated for mass in self.seen.values())
+        x = fit_profiles(
+            self.residuals, self.left, theta[1:].ravel(), prior, self.options,
+            calibrated=calibrated,
+        )  # fmt: skip
+        return _with_first(x)
+
+    def without_the_needless(self, theta: Array) -> Array:
+        """Leave a view alone whose correction does not clearly help it to agree."""
+        for k in range(1, len(theta)):
+            less = theta.copy()
+            less[k] = 0.0
+            alone = self.mean_disagreement(less, k)
+            if self.mean_disagreement(theta, k) > self.options.min_gain * alone:
+                theta = less
+        return theta
+
+
+def _with_first(x: Array) -> Array:
+    """(V, 5) corrections from the unknowns: the first view stays."""
+    return np.vstack([np.zeros(5), x.reshape(-1, 5)])

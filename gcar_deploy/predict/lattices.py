@@ -1,0 +1,88 @@
+"""Several looks at one scene: the predictor asked on lattices shifted against each other.
+
+Where a thin vessel falls between the points of one lattice decides more of the evidence than it
+should. A second lattice, half a cell off along each axis (together they are body-centred cubic),
+sees what falls between the points of the first; the mean of both is sampled at the first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.predict.hull import Candidates
+from gcar_deploy.types import Array, Scalars
+
+#: cells by which each lattice is shifted; the second fills the gaps of the first, and so on
+SHIFTS = ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.25, 0.5, 0.75), (0.75, 0.0, 0.25))
+
+
+def shifted_lattice(lattice: Grid, look: int) -> Grid:
+    """Return ``lattice`` moved by its look's share of a cell; look 0 is the lattice itself."""
+    if look == 0:
+        return lattice
+    x, y, z = np.asarray(lattice.center_mm) + np.asarray(SHIFTS[look]) * lattice.spacing_mm
+    return dataclasses.replace(lattice, center_mm=(float(x), float(y), float(z)))
+
+
+def near_evidence(first: Candidates, confidence: Scalars, look: int, least: float) -> Array:
+    """Find the points of a later look within 1.5 cells (per axis) of what the first believed.
+
+    Parameters
+    ----------
+    first : Candidates (n) of look 0
+    confidence : (n,) what the predictor said of them
+    look : int
+    least : points of the first look below this confidence are not asked again
+
+    Returns
+    -------
+    (m, 3) int64, unique, within the lattice
+    """
+    shape = np.asarray(first.lattice.shape)
+    steps = [np.arange(np.ceil(-s - 1.5), np.floor(-s + 1.5) + 1) for s in SHIFTS[look]]
+    offsets = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3).astype(np.int64)
+    believed = first.index[confidence >= least]
+    index = (believed[:, None] + offsets).reshape(-1, 3)
+    index = index[((index >= 0) & (index < shape)).all(axis=1)]
+    marked = np.zeros(shape, bool)
+    marked[tuple(index.T)] = True
+    return np.argwhere(marked)
+
+
+def mean_evidence(
+    first: CenterPoints, others: Sequence[tuple[Candidates, CenterPoints]]
+) -> CenterPoints:
+    """Average the confidences of ``first`` with those of other lattices at its points.
+
+    Parameters
+    ----------
+    first : CenterPoints (n), as the predictor gave them
+    others : per further look its candidates and what the predictor said of them, in their order
+
+    Returns
+    -------
+    CenterPoints
+        ``first`` with the mean confidence; what is no candidate of a look counts 0 there.
+    """
+    confidence = first.confidence.copy()
+    for candidates, told in others:
+        confidence += _sampled(candidates, told.confidence, first)
+    return dataclasses.replace(first, confidence=confidence / (1 + len(others)))
+
+
+def _sampled(candidates: Candidates, values: Scalars, at: CenterPoints) -> Scalars:
+    """(n,) trilinear ``values`` of ``candidates`` at other points."""
+    if not len(candidates):
+        return np.zeros(len(at.points_mm))
+    low = candidates.index.min(axis=0)
+    dense = np.zeros(candidates.index.max(axis=0) - low + 1, np.float32)
+    dense[tuple((candidates.index - low).T)] = values
+    place = candidates.lattice.world2index(at.points_mm) - low
+    out: Scalars = map_coordinates(dense, place.T, order=1, mode="constant", output=np.float64)
+    return out

@@ -1,0 +1,1 @@
+"""Quality: whether a tree can honestly be made, and how far to trust it."""

@@ -1,0 +1,220 @@
+"""Choose among candidate vessel pieces: those that together explain every view once.
+
+Two views leave ghosts: a piece of one vessel in view 1 married to a piece of another in view 2.
+A ghost's rays are explained without it, so with every piece as thick as the pictures would allow
+if it were alone, the shares a of
+
+    min over 0 <= a <= 1 of  0.5 sum_pixels ((path - sum_k a_k path_k) / sigma)^2 area + cost . a
+
+go to 0 for ghosts and to 1 for vessels. The cost per mm grows as the starting points' confidence
+falls (and is a reward where it is high): evidence decides where the pictures leave two ways open.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.optimize import minimize
+
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.tree.edit import kept_branches, part_of
+from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
+from gcar_deploy.tubes.support import least_seen
+from gcar_deploy.tubes.targets import Target
+from gcar_deploy.types import Array, Scalars
+
+#: least sine between vessel and ray when a path is turned into a radius.
+MIN_SINE = 0.35
+#: radii believed when a piece stands alone, mm.
+ALONE_BOUNDS_MM = (0.3, 3.5)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pieces:
+    """Stretches of branches that are kept or dropped as one.
+
+    Attributes
+    ----------
+    segment : (s,) piece of each segment
+    length_mm, confidence : (k,)
+    share : (k,) 0 .. 1, how much of it the pictures want
+    """
+
+    segment: Array
+    length_mm: Scalars
+    confidence: Scalars
+    share: Scalars
+
+
+def kept_tree(tree: Tree, pieces: Pieces, options: TubeOptions) -> Tree:
+    """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
+    return _kept(tree, tubes_of(tree), pieces, options)
+
+
+def reinstated(
+    tree: Tree,
+    pieces: Pieces,
+    start_radius: Scalars,
+    targets: list[Target],
+    left: list[Array],
+    options: TubeOptions,
+) -> Pieces:
+    """Take back dropped pieces that the views miss after all (``least_seen``).
+
+    Vessels that overlap each other in all views seem too thick alone, and the shares may call
+    one of them a ghost; once the others are fitted without it, its path is missing.
+
+    Parameters
+    ----------
+    tree : Tree before any piece was dropped
+    pieces : Pieces of it
+    start_radius : (n,) radius of its branch points by the starting points, mm
+    targets : one per view
+    left : per view (rows, cols), path that the kept pieces leave unexplained, mm
+    options : TubeOptions
+    """
+    tubes = dataclasses.replace(tubes_of(tree), log_radius=np.log(start_radius))
+    dropped = pieces.share < options.min_share
+    count = len(pieces.share)
+    found = []
+    for target, rest in zip(targets, left, strict=True):
+        seen = footprint(tubes, target.carm, target.box_px)
+        piece = pieces.segment[seen.segment]
+        claim = np.minimum(rest.reshape(-1)[seen.pixel], seen.path_mm)
+        whole = np.bincount(piece, seen.path_mm, minlength=count)
+        found.append(np.bincount(piece, claim, minlength=count) / np.maximum(whole, 1e-9))
+    missed = dropped & (least_seen(np.stack(found)) >= options.missed_share)
+    return dataclasses.replace(pieces, share=np.where(missed, 1.0, pieces.share))
+
+
+def weigh_pieces(
+    tree: Tree,
+    tubes: Tubes,
+    start_radius: Scalars,
+    targets: list[Target],
+    options: TubeOptions,
+) -> Pieces:
+    """Cut the branches into pieces and solve for their shares."""
+    segment = _piece_of_segment(tree, tubes, options.piece_mm)
+    count = int(segment.max()) + 1
+    points = tubes.points_mm
+    length = np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1)
+    total: Scalars = np.bincount(segment, length, minlength=count).astype(np.float64)
+    trust = np.concatenate([branch.confidence for branch in tree.branches])
+    own = 0.5 * (trust[tubes.first] + trust[tubes.second])
+    confidence: Scalars = np.bincount(segment, own * length, minlength=count) / np.maximum(
+        total, 1e-9
+    )
+    # Vessels that overlap each other in every view would all seem thick: the points say less.
+    radius = np.minimum(radius_alone(tubes, targets), options.piece_growth * start_radius)
+    alone = dataclasses.replace(tubes, log_radius=np.log(radius))
+    gram, pull = _normal(alone, segment, count, targets)
+    cost = options.piece_cost * total * (options.fair_confidence - confidence)
+    share = _solve(gram, pull - cost, confidence)
+    kept = share >= options.min_share
+    if kept.any():
+        # The level of confidence depends on the predictor; ghosts stand out below its usual.
+        usual = _weighted_median(confidence[kept], total[kept])
+        share = np.where(confidence >= options.trusted_share * usual, 1.0, share)
+    return Pieces(segment, total, confidence, share)
+
+
+def radius_alone(tubes: Tubes, targets: list[Target]) -> Scalars:
+    """(n,) radius each point could have if no other vessel lay on its rays: least over views."""
+    out = np.full(len(tubes.log_radius), np.inf)
+    points = tubes.points_mm
+    tangent = np.zeros_like(points)
+    step = points[tubes.second] - points[tubes.first]
+    np.add.at(tangent, tubes.first, step)
+    np.add.at(tangent, tubes.second, step)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    for target in targets:
+        pixels, _ = target.carm.project(points)
+        ray = points - target.carm.source_mm
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        sine = np.maximum(np.linalg.norm(np.cross(tangent, ray), axis=1), MIN_SINE)
+        # The blurred picture's ridge: the highest value within about a pixel.
+        ridge = ndimage.maximum_filter(target.path_mm / target.contrast, size=3)
+        at = [np.nan_to_num(pixels[:, 1], nan=-9.0), np.nan_to_num(pixels[:, 0], nan=-9.0)]
+        path = ndimage.map_coordinates(ridge, at, order=1, mode="constant", cval=0.0)
+        out = np.minimum(out, 0.5 * sine * path)
+    smooth = np.empty_like(out)
+    for k in range(int(tubes.point_branch.max()) + 1):
+        part = tubes.point_branch == k
+        smooth[part] = ndimage.median_filter(out[part], size=7, mode="nearest")
+    return np.clip(smooth, *ALONE_BOUNDS_MM)
+
+
+def _piece_of_segment(tree: Tree, tubes: Tubes, piece_mm: float) -> Array:
+    out = np.zeros(len(tubes.first), np.int64)
+    used = 0
+    for k, branch in enumerate(tree.branches):
+        own = tubes.branch == k
+        middle = 0.5 * (branch.arc_mm[1:] + branch.arc_mm[:-1])
+        pieces = max(int(np.ceil(branch.length_mm / piece_mm)), 1)
+        share = middle / max(branch.length_mm, 1e-9)
+        out[own] = used + np.minimum((share * pieces).astype(np.int64), pieces - 1)
+        used += pieces
+    return out
+
+
+def _normal(tubes: Tubes, piece: Array, count: int, targets: list[Target]) -> tuple[Array, Scalars]:
+    """Gram matrix (k, k) of the pieces' pictures and their products with the data (k,)."""
+    gram = np.zeros((count, count))
+    pull = np.zeros(count)
+    for target in targets:
+        seen = footprint(tubes, target.carm, target.box_px)
+        size = target.path_mm.size
+        weight = (target.weight / target.sigma_mm**2).reshape(-1) * target.pixel_mm**2
+        U = sparse.csr_matrix(
+            (seen.path_mm * target.contrast, (seen.pixel, piece[seen.segment])),
+            shape=(size, count),
+        )
+        WU = sparse.diags(weight) @ U
+        gram += np.asarray((U.T @ WU).todense())
+        pull += WU.T @ target.path_mm.reshape(-1)
+    return gram, pull
+
+
+def _solve(gram: Array, pull: Scalars, start: Scalars) -> Scalars:
+    def value(a: Scalars) -> tuple[float, Scalars]:
+        ga = gram @ a
+        return 0.5 * float(a @ ga) - float(pull @ a), ga - pull
+
+    found = minimize(
+        value, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(start),
+        options={"maxiter": 300, "maxcor": 20},
+    )  # fmt: skip
+    out: Scalars = np.clip(found.x, 0.0, 1.0)
+    return out
+
+
+def _weighted_median(values: Scalars, weight: Scalars) -> float:
+    order = np.argsort(values, kind="stable")
+    part = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(part, 0.5 * part[-1])])
+
+
+def _kept(tree: Tree, tubes: Tubes, pieces: Pieces, options: TubeOptions) -> Tree:
+    """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
+    branches: list[Branch] = []
+    nodes = list(tree.nodes_mm)
+    for k, branch in enumerate(tree.branches):
+        own = np.flatnonzero(tubes.branch == k)
+        wanted = pieces.share[pieces.segment[own]] >= options.min_share
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(int), [0]])))
+        for first, stop in edges.reshape(-1, 2):
+            part = part_of(branch, int(first), int(stop))
+            start, end = branch.start, branch.end
+            if first > 0:
+                start = len(nodes)
+                nodes.append(part.points_mm[0])
+            if stop < len(own):
+                end = len(nodes)
+                nodes.append(part.points_mm[-1])
+            branches.append(dataclasses.replace(part, start=start, end=end))
+    cut = Tree(nodes_mm=np.array(nodes), branches=tuple(branches))
+    return kept_branches(cut, np.ones(len(branches), bool))

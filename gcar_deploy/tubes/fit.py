@@ -1,0 +1,244 @@
+"""The default refiner: settle the points, build the tree, fit it, cut and grow, state sigma."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gcar_deploy.config import TreeOptions, TubeOptions
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.tree.centerline import build_tree, usable_points
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes.choice import kept_tree, reinstated, weigh_pieces
+from gcar_deploy.tubes.gauss_newton import (
+    Progress,
+    fit_level,
+    footprints,
+    normal_equations,
+    rescaled,
+)
+from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
+from gcar_deploy.tubes.prior import Prior, make_prior
+from gcar_deploy.tubes.radius_refit import fit_calibre
+from gcar_deploy.tubes.settle import settled
+from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, unexplained
+from gcar_deploy.tubes.targets import Target, make_targets
+from gcar_deploy.tubes.uncertainty import fit_sigma, geometry_sigma
+from gcar_deploy.types import Array, Scalars
+
+#: error of a tube between the pixels, as a share of the coarsest pixel at the isocentre. Chosen
+#: on generated trees (``gcar-export sigma-table --seed 1``), to be judged on another seed
+PIXEL_SHARE = 0.45
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TubeFit:
+    """Outcome of the tube refiner.
+
+    Attributes
+    ----------
+    tree : Tree with sigma per point; empty where nothing could be built
+    centers : CenterPoints the tree was built from
+    scatter_mm : float, estimated scatter of the starting points (0 on a lattice)
+    contrast : tuple of float, per view, factor of the picture's path on the model's
+    progress : Progress
+    model_mm : per view (rows, cols) path of the tubes at the picture's own pixels; empty where
+        the fit ended before that level
+    """
+
+    tree: Tree
+    centers: CenterPoints
+    scatter_mm: float
+    contrast: tuple[float, ...]
+    progress: Progress
+    model_mm: tuple[Array, ...] = ()
+
+
+def fit_tubes(
+    centers: CenterPoints,
+    views: Sequence[VesselImage],
+    options: TubeOptions,
+    tree_options: TreeOptions | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> TubeFit:
+    """Fit a tube tree to the pictures from starting points.
+
+    Parameters
+    ----------
+    centers : CenterPoints
+    views : sequence of VesselImage, one or more
+    options, tree_options : frozen options
+    should_stop : callable, asked before each step; True ends the fit with the best so far
+    """
+    progress = Progress()
+    settled_centers, scatter = settled(
+        usable_points(centers), [(view.carm, view.path_mm) for view in views]
+    )
+    if should_stop is not None:
+        # Whoever cancelled raises here; a deadline is heeded by the first step.
+        should_stop()
+    tree = build_tree(settled_centers, tree_options)
+    fit = TubeFit(
+        tree=tree,
+        centers=settled_centers,
+        scatter_mm=scatter,
+        contrast=(1.0,) * len(views),
+        progress=progress,
+    )
+    return _fitted(fit, views, _Run(options, progress, should_stop)) if tree.branches else fit
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Run:
+    """What every stage of one fit shares."""
+
+    options: TubeOptions
+    progress: Progress
+    should_stop: Callable[[], bool] | None
+
+    def fit(self, tree: Tree, targets: list[Target], steps: int) -> _State:
+        """Fit from where the tree is now."""
+        tubes, prior = _start(tree, self.options, _pixel_mm(targets))
+        prints: list[Footprint] = []
+        if tree.branches:
+            tubes, prints = fit_level(
+                tubes, targets, prior, self.options, steps, self.progress, self.should_stop
+            )
+        return _State(tree_of(tubes, tree), tubes, prior, prints)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _State:
+    """A tree, its tubes, the prior round its start, and where the tubes fall in each view."""
+
+    tree: Tree
+    tubes: Tubes
+    prior: Prior
+    prints: list[Footprint]
+
+
+def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
+    options, progress = run.options, run.progress
+    targets: list[Target] = []
+    start_radius = start.tree.radii()
+    now = _State(start.tree, *_start(start.tree, options), [])
+    for number, (level, steps) in enumerate(zip(options.levels_mm, options.steps, strict=True)):
+        if number and (progress.stopped or progress.failed):
+            break
+        targets = _contrasts(make_targets(views, level, options), targets)
+        prior = now.prior.at_pixel(_pixel_mm(targets), options)
+        tubes, prints = fit_level(
+            now.tubes, targets, prior, options, steps, progress, run.should_stop
+        )
+        now = _State(tree_of(tubes, now.tree), tubes, prior, prints)
+        if number or len(options.levels_mm) == 1:
+            continue
+        if options.min_share > 0 and len(targets) > 1:
+            now = _chosen(now, start_radius, targets, run)
+        if now.tree.branches:
+            now = run.fit(_supported(now, targets, options), targets, steps // 2)
+        if not now.tree.branches:
+            break
+    contrast = tuple(target.contrast for target in targets)
+    if not now.tree.branches:
+        return dataclasses.replace(start, tree=now.tree, contrast=contrast)
+    if not (options.levels_mm[-1] or progress.stopped or progress.failed):
+        now = _recalibred(now, targets, options)
+    targets = rescaled(targets, now.prints)
+    own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
+    return dataclasses.replace(
+        start,
+        tree=with_sigma(now, targets, options),
+        contrast=tuple(target.contrast for target in targets),
+        model_mm=tuple(
+            seen.image(target.path_mm.shape)
+            for target, seen in zip(targets, now.prints, strict=True)
+        )
+        if own and not options.levels_mm[-1]
+        else (),
+    )
+
+
+def _recalibred(now: _State, targets: list[Target], options: TubeOptions) -> _State:
+    """Refit the radii where the pixels are fine enough to show a narrow core."""
+    if _pixel_mm(targets) >= options.taper_pixel_mm:
+        return now
+    tubes, prints = fit_calibre(now.tubes, targets, now.prints, options)
+    return _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
+
+
+def _pixel_mm(targets: Sequence[Target]) -> float:
+    """Coarsest pixel at the isocentre, mm."""
+    return max(target.pixel_mm for target in targets)
+
+
+def _start(tree: Tree, options: TubeOptions, pixel_mm: float = np.inf) -> tuple[Tubes, Prior]:
+    tubes = tubes_of(tree)
+    trust = np.concatenate([np.zeros(0), *(branch.confidence for branch in tree.branches)])
+    return tubes, make_prior(tubes, trust, options, pixel_mm)
+
+
+def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
+    if not before:
+        return targets
+    return [
+        dataclasses.replace(new, contrast=old.contrast)
+        for new, old in zip(targets, before, strict=True)
+    ]
+
+
+def _chosen(now: _State, start_radius: Scalars, targets: list[Target], run: _Run) -> _State:
+    """Drop ghosts, fit the rest, and take back what every view then misses."""
+    options, tree = run.options, now.tree
+    targets = rescaled(targets, now.prints)
+    pieces = weigh_pieces(tree, now.tubes, start_radius, targets, options)
+    steps = options.steps[0] // 2
+    kept = run.fit(kept_tree(tree, pieces, options), targets, steps)
+    prints = kept.prints or footprints(kept.tubes, targets)
+    left = unexplained(targets, prints)
+    back = reinstated(tree, pieces, start_radius, targets, left, options)
+    if np.array_equal(back.share, pieces.share):
+        return kept
+    return run.fit(kept_tree(tree, back, options), targets, steps)
+
+
+def _supported(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
+    """Cut what the pictures do not show, then grow along what the tree does not explain."""
+    targets = rescaled(targets, now.prints)
+    share = seen_share(now.tubes, targets, now.prints)
+    tree = supported_tree(now.tree, now.tubes, share, options)
+    if not tree.branches or options.max_growth_mm <= 0:
+        return tree
+    left = unexplained(targets, footprints(tubes_of(tree), targets))
+    return grown_tree(tree, targets, left, options)
+
+
+def tree_of(tubes: Tubes, tree: Tree) -> Tree:
+    """Return ``tree`` with the positions and radii of ``tubes``, which was made from it."""
+    points, radii = tubes.points_mm, tubes.radius_mm
+    branches = []
+    for k, branch in enumerate(tree.branches):
+        own = tubes.point_branch == k
+        branches.append(dataclasses.replace(branch, points_mm=points[own], radius_mm=radii[own]))
+    nodes = tubes.positions_mm[: len(tree.nodes_mm)]
+    return dataclasses.replace(tree, nodes_mm=nodes, branches=tuple(branches))
+
+
+def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
+    """Return the tree with sigma per point: fit, geometry prior and pixel, in quadrature."""
+    tree, tubes = now.tree, now.tubes
+    hessian, _ = normal_equations(tubes, targets, now.prints, now.prior, options)
+    tangents = np.zeros_like(tubes.positions_mm)
+    tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
+    own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]
+    geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets], options)
+    pixel = PIXEL_SHARE * _pixel_mm(targets)
+    sigma = np.sqrt(own**2 + geometry**2 + pixel**2)
+    branches = [
+        dataclasses.replace(branch, sigma_mm=sigma[tubes.point_branch == k])
+        for k, branch in enumerate(tree.branches)
+    ]
+    return dataclasses.replace(tree, branches=tuple(branches))

@@ -1,0 +1,237 @@
+"""Gauss-Newton fit of a tube tree to path-length pictures.
+
+Unknowns: the position of every centreline point and the log of its radius. Objective:
+
+    sum over pixels of rho((path - contrast * model) / sigma) * area     (Cauchy, IRLS)
+    + bending + taper + distance from the start                          (tube_prior)
+
+Points couple along the branch only, apart from shared bifurcations, so the normal equations are
+banded and one step costs what the vessels' length costs. Rays through several vessels weigh each
+by the number of crossings, which majorises the coupling that is left out (Jacobi's bound): steps
+stay descent steps. A step that does not lower the objective is rejected and damped further.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.tubes.arrow import Arrow
+from gcar_deploy.tubes.model import Footprint, Tubes, footprint
+from gcar_deploy.tubes.prior import Prior, columns_of
+from gcar_deploy.tubes.targets import Target
+from gcar_deploy.types import Array, Scalars
+
+#: bounds of the radius, mm.
+RADIUS_BOUNDS_MM = (0.2, 5.0)
+#: a step never moves a point or a log radius by more than this.
+MAX_MOVE_MM = 1.5
+MAX_LOG_STEP = 0.4
+#: rejected steps in a row after which a level gives up.
+MAX_REJECTED = 5
+
+
+@dataclasses.dataclass(eq=False)
+class Progress:
+    """What a fit did so far.
+
+    Attributes
+    ----------
+    losses : list of float
+        Objective after each accepted step; a new level starts a new scale.
+    steps, rejected : int
+    stopped : bool
+        The caller asked to stop (deadline or cancel).
+    failed : bool
+        The objective was not finite.
+    """
+
+    losses: list[float] = dataclasses.field(default_factory=list)
+    steps: int = 0
+    rejected: int = 0
+    stopped: bool = False
+    failed: bool = False
+
+
+def fit_level(
+    tubes: Tubes,
+    targets: list[Target],
+    prior: Prior,
+    options: TubeOptions,
+    steps: int,
+    progress: Progress,
+    should_stop: Callable[[], bool] | None = None,
+) -> tuple[Tubes, list[Footprint]]:
+    """Run up to ``steps`` damped Gauss-Newton steps; returns the best tubes, and their prints."""
+    damping = 1e-3
+    prints = footprints(tubes, targets)
+    targets = rescaled(targets, prints)
+    loss = objective(tubes, targets, prints, prior, options)
+    progress.losses.append(loss)
+    if not np.isfinite(loss):
+        progress.failed = True
+        return tubes, prints
+    for _ in range(steps):
+        if should_stop is not None and should_stop():
+            progress.stopped = True
+            break
+        hessian, gradient = normal_equations(tubes, targets, prints, prior, options)
+        for _attempt in range(MAX_REJECTED):
+            trial = moved(tubes, _solve(hessian, gradient, damping))
+            trial_prints = footprints(trial, targets, prints)
+            value = objective(trial, targets, trial_prints, prior, options)
+            if np.isfinite(value) and value < loss:
+                break
+            damping = max(damping * 10, 1e-2)
+            progress.rejected += 1
+        else:
+            break
+        damping = max(damping * 0.3, 1e-4)
+        gain = (loss - value) / max(abs(loss), 1e-12)
+        tubes, prints, loss = trial, trial_prints, value
+        targets = rescaled(targets, prints)
+        progress.steps += 1
+        progress.losses.append(loss)
+        if gain < options.tolerance:
+            break
+    return tubes, prints
+
+
+def footprints(
+    tubes: Tubes, targets: list[Target], before: list[Footprint] | None = None
+) -> list[Footprint]:
+    """Project the tubes into every target; ``before`` is an earlier result, for its pairs."""
+    pairings = [None] * len(targets) if before is None else [seen.pairing for seen in before]
+    return [
+        footprint(tubes, target.carm, target.box_px, pairing)
+        for target, pairing in zip(targets, pairings, strict=True)
+    ]
+
+
+def rescaled(targets: list[Target], prints: list[Footprint]) -> list[Target]:
+    """Refit the contrast of pictures that are not calibrated."""
+    return [
+        target if target.calibrated else target.with_contrast(seen.image(target.path_mm.shape))
+        for target, seen in zip(targets, prints, strict=True)
+    ]
+
+
+def objective(
+    tubes: Tubes,
+    targets: list[Target],
+    prints: list[Footprint],
+    prior: Prior,
+    options: TubeOptions,
+) -> float:
+    """Return the objective (half the sum of squares where nothing is robust)."""
+    total = prior.value(unknowns(tubes))
+    c2 = options.robust_sigmas**2
+    for target, seen in zip(targets, prints, strict=True):
+        # Pixels without a tube cost what they cost an empty model.
+        pixel = seen.pixel[seen.first]
+        path = target.path_mm.reshape(-1)[pixel]
+        sigma = target.sigma_mm.reshape(-1)[pixel]
+        z2 = ((path - target.contrast * seen.totals()) / sigma) ** 2
+        change = np.log1p(z2 / c2) - np.log1p((path / sigma) ** 2 / c2)
+        cost = target.empty_cost + float((change * target.weight.reshape(-1)[pixel]).sum())
+        total += 0.5 * c2 * cost * target.pixel_mm**2
+    return total
+
+
+def normal_equations(
+    tubes: Tubes,
+    targets: list[Target],
+    prints: list[Footprint],
+    prior: Prior,
+    options: TubeOptions,
+) -> tuple[Arrow, Scalars]:
+    """Hessian (Gauss-Newton, majorised) and gradient over the unknowns."""
+    count = len(tubes.first)
+    size = 3 * len(tubes.positions_mm) + len(tubes.log_radius)
+    blocks = np.zeros((count, 8, 8))
+    pull = np.zeros((count, 8))
+    for target, seen in zip(targets, prints, strict=True):
+        if not len(seen.pixel):
+            continue
+        e = (target.path_mm.reshape(-1)[seen.pixel[seen.first]] - target.contrast * seen.totals())[
+            seen.group
+        ]
+        sigma = target.sigma_mm.reshape(-1)[seen.pixel]
+        robust = 1.0 / (1.0 + (e / (options.robust_sigmas * sigma)) ** 2)
+        w = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
+        moments = _moments(seen, w * seen.crossings * target.contrast**2, count)
+        pulls = _pulls(seen, w * e * target.contrast, count)
+        M = _to_unknowns(tubes, target.carm)
+        blocks += M @ moments @ np.swapaxes(M, 1, 2)
+        pull += (M @ pulls[:, :, None])[:, :, 0]
+    gradient = prior.gradient(unknowns(tubes))
+    gradient -= np.bincount(columns_of(tubes).reshape(-1), pull.reshape(-1), minlength=size)
+    return prior.added(blocks), gradient
+
+
+def _basis(seen: Footprint) -> tuple[Scalars, ...]:
+    """Six derivatives of an entry's path: by both ends' pixels (col, row) and log radii."""
+    # The distance shrinks when the axis moves towards the pixel.
+    x = -seen.d_distance * seen.normal[:, 0]
+    y = -seen.d_distance * seen.normal[:, 1]
+    r, t = seen.d_log_radius, seen.t
+    s = 1 - t
+    return x * s, y * s, x * t, y * t, r * s, r * t
+
+
+def _moments(seen: Footprint, weight: Scalars, count: int) -> Array:
+    """(s, 6, 6) weighted sums of products of the derivatives over each segment's entries."""
+    basis = _basis(seen)
+    out = np.empty((count, 6, 6))
+    for a in range(6):
+        scaled = weight * basis[a]
+        for b in range(a, 6):
+            out[:, a, b] = np.bincount(seen.segment, scaled * basis[b], minlength=count)
+            out[:, b, a] = out[:, a, b]
+    return out
+
+
+def _pulls(seen: Footprint, weight: Scalars, count: int) -> Array:
+    """(s, 6) weighted sums of the derivatives over each segment's entries."""
+    sums = [np.bincount(seen.segment, weight * d, minlength=count) for d in _basis(seen)]
+    return np.stack(sums, axis=1)
+
+
+def _to_unknowns(tubes: Tubes, carm: CArm) -> Array:
+    """(s, 8, 6) from derivatives by pixels and log radii to those by a segment's unknowns."""
+    J = np.swapaxes(carm.jacobian(tubes.points_mm), 1, 2)
+    out = np.zeros((len(tubes.first), 8, 6))
+    out[:, 0:3, 0:2] = J[tubes.first]
+    out[:, 3:6, 2:4] = J[tubes.second]
+    out[:, 6, 4] = out[:, 7, 5] = 1.0
+    return out
+
+
+def _solve(hessian: Arrow, gradient: Scalars, damping: float) -> Scalars:
+    """Damped step; NaN, which no one accepts, where the matrix is not positive definite."""
+    factor = hessian.damped(damping, 1e-9).factorised()
+    return np.full(len(gradient), np.nan) if factor is None else factor.solve(-gradient)
+
+
+def unknowns(tubes: Tubes) -> Scalars:
+    """All unknowns as one vector: positions, then log radii."""
+    return np.concatenate([tubes.positions_mm.reshape(-1), tubes.log_radius])
+
+
+def moved(tubes: Tubes, step: Scalars) -> Tubes:
+    """Apply a step, bounded in length and in radius."""
+    split = 3 * len(tubes.positions_mm)
+    move = step[:split].reshape(-1, 3)
+    length = np.linalg.norm(move, axis=1, keepdims=True)
+    move = move * np.minimum(1.0, MAX_MOVE_MM / np.maximum(length, 1e-12))
+    grow = np.clip(step[split:], -MAX_LOG_STEP, MAX_LOG_STEP)
+    low, high = np.log(RADIUS_BOUNDS_MM)
+    return dataclasses.replace(
+        tubes,
+        positions_mm=tubes.positions_mm + move,
+        log_radius=np.clip(tubes.log_radius + grow, low, high),
+    )

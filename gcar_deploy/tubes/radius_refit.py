@@ -1,0 +1,111 @@
+"""Radii once more, with the axes held: what smooths a vessel's course rounds off a stenosis.
+
+The fit of ``tube.py`` has to find where a vessel runs, and its prior on the radius, a random walk
+of the logarithm with Gaussian steps, keeps ghosts and overlaps from bending it. A narrow core pays
+for its two steep flanks there. When the axes stand, the pictures' own pixels say more about the
+radius, and the steps may be rare and large: their prior is Student's t,
+
+    0.5 (nu + 1) log(1 + z^2 / nu),   z = step of log radius / (walk sqrt(gap in mm)),
+
+by reweighting (the weight of a step is (nu + 1) / (nu + z^2); Lange, Little and Taylor, J Am Stat
+Assoc 84:881, 1989). Neighbours along a branch are all that couples, so each step is tridiagonal.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.tubes.gauss_newton import MAX_LOG_STEP, RADIUS_BOUNDS_MM, footprints
+from gcar_deploy.tubes.model import Footprint, Tubes
+from gcar_deploy.tubes.targets import Target
+from gcar_deploy.types import Scalars
+
+#: reweightings of the prior for each look at the pictures
+_REWEIGHTINGS = 3
+
+
+def fit_calibre(
+    tubes: Tubes, targets: list[Target], prints: list[Footprint], options: TubeOptions
+) -> tuple[Tubes, list[Footprint]]:
+    """Refit the radii of tubes whose axes stand.
+
+    Parameters
+    ----------
+    tubes : Tubes after the last level
+    targets : of the pictures' own pixels
+    prints : where the tubes fall in them
+    options : TubeOptions; ``calibre_steps``, ``calibre_noise_mm``, ``calibre_walk``,
+        ``calibre_freedom``
+
+    Returns
+    -------
+    tubes, and where they fall; as given where a picture is not calibrated, whose contrast would
+    have to be guessed along with the radii, or where a step leaves the finite numbers
+    """
+    if not all(target.calibrated for target in targets) or not len(tubes.log_radius):
+        return tubes, prints
+    sharp = [
+        dataclasses.replace(
+            target, sigma_mm=options.calibre_noise_mm + options.noise_share * target.path_mm
+        )
+        for target in targets
+    ]
+    low, high = np.log(RADIUS_BOUNDS_MM)
+    for _ in range(options.calibre_steps):
+        step = _step(tubes, sharp, prints, options)
+        if not np.isfinite(step).all():
+            break
+        radius = np.clip(tubes.log_radius + step, low, high)
+        tubes = dataclasses.replace(tubes, log_radius=radius)
+        prints = footprints(tubes, targets, prints)
+    return tubes, prints
+
+
+def _step(
+    tubes: Tubes, targets: list[Target], prints: list[Footprint], options: TubeOptions
+) -> Scalars:
+    """(n,) bounded step of the log radii that the pictures and the prior want."""
+    diagonal, beside, pull = _pictures(tubes, targets, prints, options)
+    x0 = tubes.log_radius
+    a, b = tubes.first, tubes.second
+    gap = np.maximum(np.linalg.norm(tubes.points_mm[b] - tubes.points_mm[a], axis=1), 1e-3)
+    stiff = 1.0 / (options.calibre_walk**2 * gap)
+    wanted = pull + diagonal * x0
+    wanted[:-1] += beside[:-1] * x0[1:]
+    wanted[1:] += beside[:-1] * x0[:-1]
+    x = x0
+    for _ in range(_REWEIGHTINGS):
+        nu = options.calibre_freedom
+        q = stiff * (nu + 1) / (nu + stiff * (x[b] - x[a]) ** 2)
+        n = len(x0)
+        band = np.stack([diagonal + np.bincount(a, q, n) + np.bincount(b, q, n) + 1e-9, beside])
+        band[1, a] -= q
+        x = solveh_banded(band, wanted + 1e-9 * x0, lower=True, check_finite=False)
+    step: Scalars = np.clip(x - x0, -MAX_LOG_STEP, MAX_LOG_STEP)
+    return step
+
+
+def _pictures(
+    tubes: Tubes, targets: list[Target], prints: list[Footprint], options: TubeOptions
+) -> tuple[Scalars, Scalars, Scalars]:
+    """Gauss-Newton terms of the pictures over the log radii: diagonal, beside it, pull, (n,)."""
+    n = len(tubes.log_radius)
+    diagonal, beside, pull = np.zeros(n), np.zeros(n), np.zeros(n)
+    for target, seen in zip(targets, prints, strict=True):
+        error = (target.path_mm.reshape(-1)[seen.pixel[seen.first]] - seen.totals())[seen.group]
+        sigma = target.sigma_mm.reshape(-1)[seen.pixel]
+        robust = 1.0 / (1.0 + (error / (options.robust_sigmas * sigma)) ** 2)
+        weight = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
+        first, t, slope = tubes.first[seen.segment], seen.t, seen.d_log_radius
+        # Crossings majorise the coupling of vessels that share a ray, as in ``tube.py``.
+        curve = weight * seen.crossings * slope**2
+        diagonal += np.bincount(first, curve * (1 - t) ** 2, n)
+        diagonal += np.bincount(first + 1, curve * t**2, n)
+        beside += np.bincount(first, curve * t * (1 - t), n)
+        pull += np.bincount(first, weight * error * slope * (1 - t), n)
+        pull += np.bincount(first + 1, weight * error * slope * t, n)
+    return diagonal, beside, pull

@@ -1,0 +1,185 @@
+"""The deliberate bugs, each with the tests that must notice it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+_CARM, _PROJECT = "tests/geometry/test_carm.py", "tests/gaussians/test_project.py"
+_FOLDER = "tests/output/test_folder.py"
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutant:
+    """One bug.
+
+    Attributes
+    ----------
+    name : what it does
+    file : path in the repository
+    old, new : text, and what stands there instead (wherever it occurs in the file)
+    tests : files or names of tests; at least one must fail
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+MUTANTS = (
+    Mutant(
+        "geometry: sign of the secondary angle",
+        "gcar_deploy/geometry/carm.py",
+        "for x in (primary_deg, secondary_deg, rotation_deg))",
+        "for x in (primary_deg, -secondary_deg, rotation_deg))",
+        (_CARM,),
+    ),
+    Mutant(
+        "geometry: degrees taken for radians",
+        "gcar_deploy/geometry/carm.py",
+        "a, b, g = (math.radians(x) for x in",
+        "a, b, g = (x for x in",
+        (_CARM,),
+    ),
+    Mutant(
+        "geometry: detector rotation the other way",
+        "gcar_deploy/geometry/carm.py",
+        "return u * cg - v * sg, u * sg + v * cg, d",
+        "return u * cg + v * sg, v * cg - u * sg, d",
+        (_CARM,),
+    ),
+    Mutant(
+        "geometry: rows and columns of the spacing swapped",
+        "gcar_deploy/geometry/scene.py",
+        "pixel_spacing_mm=(spacing[0], spacing[1]),",
+        "pixel_spacing_mm=(spacing[1], spacing[0]),",
+        ("tests/geometry/test_scene.py",),
+    ),
+    Mutant(
+        "geometry: a key that stands twice is taken",
+        "gcar_deploy/geometry/fields.py",
+        "if key in out:",
+        "if False:",
+        ("tests/cli/test_bad_input.py::test_run_refuses[key twice]",),
+    ),
+    Mutant(
+        "projection: half of the exponent lost",
+        "gcar_deploy/gaussians/project.py",
+        "-0.5 * w.exponent(f).astype(dtype)",
+        "-1.0 * w.exponent(f).astype(dtype)",
+        (_PROJECT,),
+    ),
+    Mutant(
+        "projection: peak kept instead of mass",
+        "gcar_deploy/gaussians/footprint.py",
+        "unit_mass * kappa / (2 * np.pi * np.sqrt(determinant))",
+        "np.sqrt(2 * np.pi) * gaussians.scales_mm.mean(axis=1)",
+        (_PROJECT,),
+    ),
+    Mutant(
+        "projection: covariance in half precision",
+        "gcar_deploy/gaussians/footprint.py",
+        "Sigma = half @ half.transpose(0, 2, 1)",
+        "Sigma = (half @ half.transpose(0, 2, 1)).astype(np.float16).astype(np.float64)",
+        (_PROJECT,),
+    ),
+    Mutant(
+        "loss: gradient without its factor two",
+        "gcar_deploy/gaussians/loss.py",
+        "2.0 * weight * r",
+        "weight * r",
+        ("tests/gaussians/test_paper.py",),
+    ),
+    Mutant(
+        "loss: the centreline's share and the picture's swapped",
+        "gcar_deploy/gaussians/loss.py",
+        "((alpha, valid), (1.0 - alpha, skeleton & valid))",
+        "((1.0 - alpha, valid), (alpha, skeleton & valid))",
+        ("tests/gaussians/test_paper.py",),
+    ),
+    Mutant(
+        "hashing: an altered model is loaded",
+        "gcar_deploy/models/spec.py",
+        'if digest != spec.get("sha256"):',
+        "if False:",
+        ("tests/predict/test_center_predictor.py::test_altered_model_is_refused",),
+    ),
+    Mutant(
+        "hashing: the golden case is not compared",
+        "gcar_deploy/models/golden.py",
+        "if not np.allclose(answer, expected,",
+        "if None is np.allclose(answer, expected,",
+        ("tests/models/test_golden.py",),
+    ),
+    Mutant(
+        "hashing: the picture's hash covers its beginning alone",
+        "gcar_deploy/imaging/read.py",
+        "sha256 = hashlib.sha256(data).hexdigest()",
+        "sha256 = hashlib.sha256(data[:64]).hexdigest()",
+        ("tests/imaging/test_read.py",),
+    ),
+    Mutant(
+        "hashing: the manifest lists hashes of names",
+        "gcar_deploy/output/bundle.py",
+        "hashlib.sha256(data).hexdigest()}",
+        "hashlib.sha256(name.encode()).hexdigest()}",
+        ("tests/output/test_files.py",),
+    ),
+    Mutant(
+        "models: external data pass",
+        "gcar_deploy/models/guard.py",
+        "if number == 13 or (number == 14 and value != 0):",
+        "if number == 13 and number == 14:",
+        ("tests/models/test_guard.py",),
+    ),
+    Mutant(
+        "models: values that are not finite pass",
+        "gcar_deploy/predict/center_predictor.py",
+        "or not np.isfinite(out).all():",
+        "or out.size < 0:",
+        ("tests/predict/test_center_predictor.py",),
+    ),
+    Mutant(
+        "pictures: more data than the header promises pass",
+        "gcar_deploy/imaging/png_guard.py",
+        "if size != expected:",
+        "if size < expected:",
+        ("tests/imaging/test_read.py",),
+    ),
+    Mutant(
+        "atomicity: files are copied into the place one by one",
+        "gcar_deploy/output/folder.py",
+        "_put(fresh, out_dir, scratch / OLD, force=force)",
+        '__import__("shutil").copytree(fresh, out_dir, dirs_exist_ok=True)',
+        (_FOLDER,),
+    ),
+    Mutant(
+        "atomicity: the unfinished folder stays after an error",
+        "gcar_deploy/output/scratch.py",
+        "        shutil.rmtree(scratch, ignore_errors=True)\n        if handle",
+        "        if handle",
+        (_FOLDER,),
+    ),
+    Mutant(
+        "atomicity: folders of living owners are swept",
+        "gcar_deploy/output/scratch.py",
+        "fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)",
+        "pass",
+        ("tests/output/test_scratch.py",),
+    ),
+    Mutant(
+        "output: volume without the turn from LPS to RAS",
+        "gcar_deploy/output/volume.py",
+        "affine = grid.affine_ras()",
+        "affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ grid.affine_ras()",
+        ("tests/output/test_files.py",),
+    ),
+    Mutant(
+        "worker: any token opens",
+        "gcar_deploy/worker/http.py",
+        "not hmac.compare_digest(given, expected)",
+        "not given and expected",
+        ("tests/worker/test_http.py",),
+    ),
+)  # fmt: skip

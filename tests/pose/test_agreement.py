@@ -1,0 +1,118 @@
+"""Background taken for vessel in one raw picture does not make two views contradict each other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.parts import largest_part
+from gcar_deploy.imaging.resample import resized
+from gcar_deploy.imaging.skeleton import skeletonize
+from gcar_deploy.pose.agreement import agreeing, order_of, other_order, poses_between
+
+render = pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
+from gcar_export.scenes.trees import random_tree  # noqa: E402
+
+OPTIONS = RunOptions()
+
+
+def pair(seeds=(4, 4), stranger=False, calibrated=False):
+    """Two views of the trees ``seeds``; with ``stranger`` a line of twice the mass in view 1."""
+    angiograms, views = [], []
+    for k, (a, b) in enumerate(((-30, -20), (45, 25))):
+        carm = CArm(
+            primary_angle_deg=a, secondary_angle_deg=b, sod_mm=765, sdd_mm=1100,
+            rows=192, columns=192, pixel_spacing_mm=(1.2, 1.2),
+        )  # fmt: skip
+        tree = random_tree(np.random.default_rng(seeds[k])).sides("left").segments()
+        path = render.path_lengths(carm, *tree).astype(np.float32)
+        path[path < 0.5] = 0
+        mask = path > 0
+        whole = largest_part(_view(carm, path, calibrated))
+        path, mask = whole.path_mm.copy(), whole.mask
+        if stranger and k == 0:
+            columns = np.flatnonzero(mask.any(axis=0))
+            at = columns[0] - 12 if columns[0] > 20 else columns[-1] + 8
+            path[4:188, at : at + 3] = 2.0 * path.sum() / (184 * 3)
+        views.append(_view(carm, path, calibrated))
+        angiograms.append(
+            Angiogram(
+                view_id=str(k + 1),
+                carm=carm,
+                pixels=path,
+                bit_depth=8,
+                intensity=Intensity(kind="raw"),
+                sha256="",
+            )
+        )
+    return angiograms, views
+
+
+def _view(carm, path, calibrated):
+    mask = path > 0
+    return VesselImage(
+        view_id="1", carm=carm, path_mm=path, path_error=0.0 if calibrated else 0.25, mask=mask,
+        skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="raw",
+    )  # fmt: skip
+
+
+def test_a_part_without_counterpart_is_left_out_and_said():
+    angiograms, views = pair(stranger=True)
+    assert poses_between(views, OPTIONS)[1].after > 0.35
+    kept, poses, findings = agreeing(angiograms, views, OPTIONS)
+    assert poses[1].after < 0.13
+    np.testing.assert_array_equal(kept[0].mask, pair()[1][0].mask)
+    assert kept[1] is views[1]
+    assert len(findings) == 1 and "no counterpart" in findings[0]
+    assert not (kept[0].skeleton & ~kept[0].mask).any()
+    assert (kept[0].path_mm[~kept[0].mask] == 0).all()
+
+
+def test_views_that_agree_are_left_as_they_are():
+    angiograms, views = pair()
+    kept, _, findings = agreeing(angiograms, views, OPTIONS)
+    assert findings == [] and all(a is b for a, b in zip(kept, views, strict=True))
+
+
+def test_two_trees_do_not_agree_by_leaving_parts_out():
+    angiograms, views = pair(seeds=(4, 9), stranger=True)
+    kept, poses, findings = agreeing(angiograms, views, OPTIONS)
+    assert findings == [] and kept[0] is views[0]
+    assert poses[1].after > 0.13
+
+
+def test_a_mask_given_by_the_user_and_path_lengths_are_never_cut():
+    angiograms, views = pair(stranger=True)
+    told = [dataclasses.replace(a, mask=v.mask) for a, v in zip(angiograms, views, strict=True)]
+    assert agreeing(told, views, OPTIONS)[0][0] is views[0]
+    angiograms, views = pair(stranger=True, calibrated=True)
+    assert agreeing(angiograms, views, OPTIONS)[0][0] is views[0]
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_swapped_pictures_agree_better_the_other_way_round(calibrated):
+    _, (one, two) = pair(calibrated=calibrated)
+    given = [
+        dataclasses.replace(one, carm=two.carm, view_id="2"),
+        dataclasses.replace(two, carm=one.carm),
+    ][::-1]
+    findings, hint = order_of(given, poses_between(given, OPTIONS), OPTIONS)
+    assert hint and findings == [hint] and "swapped?" in hint
+    assert order_of([one, two], poses_between([one, two], OPTIONS), OPTIONS) == ([], "")
+
+
+def test_pictures_of_two_sizes_or_three_views_have_no_other_order():
+    _, (one, two) = pair()
+    assert other_order([one, two], OPTIONS) is not None
+    assert other_order([one, resized(two, 96, 96)], OPTIONS) is None
+    assert other_order([one, two, two], OPTIONS) is None
+
+
+def test_the_order_of_two_trees_cannot_be_told():
+    """No tree explains them either way: nothing is said of swapping in particular."""
+    _, views = pair(seeds=(4, 9))
+    assert order_of(views, poses_between(views, OPTIONS), OPTIONS)[1] == ""

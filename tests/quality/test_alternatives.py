@@ -1,0 +1,55 @@
+"""What two views leave open: exchangeable vessels, and evidence in other places."""
+
+import numpy as np
+import pytest
+
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.quality.alternatives import evidence_elsewhere, exchanges, findings
+from tests.hard.phantoms import PAIR, bars, carm, seven, straight
+
+VIEWS = (carm(-40), carm(45))
+
+
+def test_parallel_bars_of_one_width_can_be_exchanged():
+    found = exchanges(bars(3), VIEWS)
+    assert len(found) == 3 and max(e.difference for e in found) < 0.15
+    (sentence,) = findings(found, None)
+    assert "40 and 40 mm" in sentence and "2 more pairs" in sentence
+
+
+def test_a_third_view_a_single_vessel_and_a_tree_leave_nothing_open():
+    assert exchanges(bars(3), (*VIEWS, carm(0, 30))) == ()
+    assert exchanges(straight(), VIEWS) == ()
+    assert exchanges(seven(), PAIR) == ()
+
+
+@pytest.mark.parametrize("change", ["thicker", "higher"])
+def test_vessels_that_differ_in_mass_or_place_cannot_be_exchanged(change):
+    import dataclasses
+
+    two = bars(2)
+    first, second = two.branches
+    if change == "thicker":
+        second = dataclasses.replace(second, radius_mm=1.5 * second.radius_mm)
+    else:
+        second = dataclasses.replace(second, points_mm=second.points_mm + np.array([0, 0, 12.0]))
+    assert exchanges(dataclasses.replace(two, branches=(first, second)), VIEWS) == ()
+
+
+def test_evidence_on_the_tree_and_beside_it():
+    tree = straight((0, 0, 1.0), 40.0, 1.0)
+    z = np.arange(-18.0, 19.0)
+    on = np.stack([0 * z, 0 * z, z], 1)
+    points = np.concatenate([on, on + np.array([10.0, 0, 0])])
+    told = CenterPoints(
+        points_mm=points, confidence=np.repeat([0.6, 0.2], len(z)),
+        radius_mm=np.full(len(points), np.nan), spacing_mm=1.0, source="multi",
+    )  # fmt: skip
+    ray = np.tile(np.arange(len(z)), 2)
+    own = np.arange(2 * len(z))
+    ones = np.ones((2, len(points)))
+    apart, together = np.stack([own, own]), np.stack([own, ray])
+    # One view sees both places on one ray, the other keeps them apart: the worst view counts.
+    assert evidence_elsewhere(tree, told, apart, ones) == pytest.approx(0)
+    assert evidence_elsewhere(tree, told, together, ones) == pytest.approx(0.25)
+    assert findings((), 0.25) and not findings((), 0.05)

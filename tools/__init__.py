@@ -1,1 +1,0 @@
-"""Tools of the project itself: command reference, battery, requirements, bill of materials."""

@@ -1,4 +1,0 @@
-"""Attempts to break gcar: fuzz, faults, determinism, mutation, soak.
-
-``python -m tools.battery VERB``; every verb prints its counts and ends with 1 on a finding.
-"""
