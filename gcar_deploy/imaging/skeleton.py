@@ -106,6 +106,31 @@ def spread(
     return np.asarray(distance, dtype=np.float32), tuple(carried)
 
 
+def averaged(
+    skeleton: Mask, inside: Mask, off_line: Image, smooth_px: float
+) -> tuple[Image, Image]:
+    """Average the sections' ``off_line`` plus distance to the line, along the line.
+
+    Returns
+    -------
+    distance : (rows, cols) float32
+        To the nearest skeleton pixel, pixels.
+    carried : (rows, cols) float32
+        Mean of distance and ``off_line`` over the pixels of ``inside`` that are nearest to that
+        skeleton pixel or, by a Gaussian weight, to those along the line from it.
+    """
+    distance, label = _to_line(skeleton)
+    which, many = label[inside], int(label.max()) + 1
+    total = np.bincount(which, (distance + off_line)[inside], many).astype(np.float32)[label]
+    count = np.bincount(which, minlength=many).astype(np.float32)[label]
+    sums = [
+        cv2.GaussianBlur(np.where(skeleton, value, np.float32(0)), (0, 0), smooth_px)
+        for value in (total, count)
+    ]
+    mean = np.asarray(sums[0] / np.maximum(sums[1], 1e-9), dtype=np.float32)
+    return np.asarray(distance, dtype=np.float32), _carried(mean, skeleton, label)
+
+
 def beside(reach: Mask, skeleton: Mask, kept: Mask) -> Mask:
     """Pixels of ``reach`` whose nearest skeleton pixel is, or touches, one of ``kept``."""
     if not kept.any():

@@ -1,0 +1,61 @@
+"""Chords from masks against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gcar_deploy.imaging.mask_path import mask_path
+from tests.imaging.phantoms import PIXEL_MM, tube_paths
+
+
+def ball(size: int, middle: tuple[float, float], radius_mm: float, pixel_mm: float):
+    """Mask by pixel centres and mean chord of a straight tube along the columns' diagonal."""
+    n = size * 8
+    row, column = (np.indices((n, n)) + 0.5) / 8 - 0.5
+    gap = ((column - middle[0]) * 0.6 - (row - middle[1]) * 0.8) * pixel_mm
+    chord = 2 * np.sqrt(np.clip(radius_mm**2 - gap**2, 0, None))
+    return (chord > 0)[4::8, 4::8], chord.reshape(size, 8, size, 8).mean((1, 3))
+
+
+@pytest.mark.parametrize("pixel_mm", [0.15, 0.3, 0.55])
+@pytest.mark.parametrize("radius_mm", [0.6, 1.2, 2.0])
+def test_a_straight_tube_has_the_chord_of_a_round_vessel(pixel_mm: float, radius_mm: float) -> None:
+    errors = []
+    for offset in (0.0, 0.21, 0.47):
+        mask, truth = ball(96, (47.3 + offset, 48.1), radius_mm, pixel_mm)
+        found = mask_path(mask, pixel_mm)
+        middle = np.zeros_like(mask)
+        middle[20:-20, 20:-20] = True  # away from the picture's border
+        errors.append(found[mask & middle].mean() / truth[mask & middle].mean() - 1)
+        wrong = np.abs(found - truth)[mask & middle].mean()
+        assert wrong < 0.25 * pixel_mm + 0.07 * radius_mm
+    assert abs(np.mean(errors)) < 0.09
+
+
+def test_a_tree_of_tubes_is_as_thick_as_it_is_wide() -> None:
+    truth = tube_paths()
+    found = mask_path(truth > 0.5, PIXEL_MM)
+    inside = truth > 1.0
+    assert np.median(found[inside] / truth[inside]) == pytest.approx(1, abs=0.06)
+    assert np.abs(found - truth)[inside].mean() < 0.2
+
+
+def test_a_line_one_pixel_wide_is_a_vessel() -> None:
+    mask = np.zeros((40, 40), bool)
+    mask[np.arange(5, 35), np.arange(5, 35)] = True
+    mask[20, 2:18] = True
+    found = mask_path(mask, 0.3)
+    assert (found[mask] > 0.2).all() and (found[mask] < 0.5).all()
+    assert (found[~mask] == 0).all()
+
+
+def test_an_empty_mask_has_no_path() -> None:
+    assert not mask_path(np.zeros((20, 30), bool), 0.3).any()
+
+
+def test_the_place_in_the_picture_does_not_matter() -> None:
+    mask = tube_paths() > 0.5
+    moved = np.zeros((300, 310), bool)
+    moved[31:287, 17:273] = mask
+    np.testing.assert_array_equal(mask_path(moved, 0.3)[31:287, 17:273], mask_path(mask, 0.3))
