@@ -23,7 +23,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.imaging.extract import asks_network
+from gcar_deploy.imaging.extract import above_half, asks_network
 from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.read import read_picture
@@ -254,7 +254,7 @@ def with_masks(
             raise ImageError(
                 f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
             )
-        mask = array > 0.5 * float(array.max())
+        mask = above_half(array)
         if not mask.any() or mask.mean() > 0.9:
             raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
         out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)

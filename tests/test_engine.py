@@ -9,11 +9,12 @@ import threading
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gcar_deploy import CArm, Engine, Result, RunOptions
 from gcar_deploy.config import PredictOptions
 from gcar_deploy.errors import CancelledError, GeometryError, ImageError, ModelError, UsageError
-from gcar_deploy.geometry.scene import Scene, View, scene_to_json
+from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.selftest import tiny_case
 
 HULL = RunOptions(predict=PredictOptions(predictor="none"))
@@ -44,6 +45,18 @@ def test_arrays_with_a_scene_a_dict_or_a_file_give_one_result(case, engine, tmp_
     whole = content(engine.reconstruct(angiograms, grid))
     for geometry in (scene, json.loads(scene_to_json(scene)), file, str(file)):
         assert content(engine.reconstruct(arrays, geometry)) == whole
+
+
+def test_masks_alone_give_the_tree(case):
+    angiograms, _, scene = case
+    _, _, tree = tiny_case()
+    views = tuple(dataclasses.replace(v, intensity=Intensity(kind="mask")) for v in scene.views)
+    masks = [(a.pixels > 300).astype(np.uint8) * 255 for a in angiograms]
+    found = Engine(threads=1).reconstruct(masks, dataclasses.replace(scene, views=views))
+    assert [v.kind for v in found.views] == ["mask"] * 2
+    off = cKDTree(tree.points()).query(found.tree.points())[0]
+    missed = cKDTree(found.tree.points()).query(tree.points())[0]
+    assert off.mean() < 1.0 and missed.mean() < 1.0
 
 
 @pytest.mark.req("REQ-36")

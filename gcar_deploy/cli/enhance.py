@@ -17,7 +17,7 @@ from gcar_deploy.cli.common import chosen_dicom
 )
 @click.option(
     "--kind",
-    type=click.Choice(["raw", "attenuation", "path_length"]),
+    type=click.Choice(["raw", "attenuation", "path_length", "mask"]),
     default="raw",
     show_default=True,
     help="What a grey value means.",

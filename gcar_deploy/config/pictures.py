@@ -104,6 +104,9 @@ class ImagingOptions:
     #: relative error of a path that was judged from contrast, and by the network
     contrast_error: Annotated[float, Range(0.01, 1)] = 0.25
     chord_error: Annotated[float, Range(0.01, 1)] = 0.15
+    #: ... and from the width of a mask: its edges are off by a part of a pixel, a vessel seen at a
+    #: slant is thicker than it is wide, and overlaps show one of two vessels
+    mask_error: Annotated[float, Range(0.01, 1)] = 0.3
     #: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's
     #: edge p. A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns
     #: in the sampling of the picture itself.

@@ -29,7 +29,7 @@ from gcar_deploy.geometry.grid import Grid
 
 SCHEMA = "gcar-geometry/1"
 MIN_VIEWS, MAX_VIEWS = 2, 16
-KINDS = ("path_length", "attenuation", "raw")
+KINDS = ("path_length", "attenuation", "raw", "mask")
 POLARITIES = ("auto", "dark", "bright")
 #: the default volume: voxels along each edge
 DEFAULT_SHAPE = 128
@@ -57,7 +57,7 @@ class Intensity:
 
     Attributes
     ----------
-    kind : ``path_length``, ``attenuation`` or ``raw``
+    kind : ``path_length``, ``attenuation``, ``raw`` or ``mask``
     polarity : ``auto``, ``dark`` or ``bright`` (how vessels look)
     mm_per_count : float or None
         mm of vessel along the ray per count; needed for ``path_length`` alone.

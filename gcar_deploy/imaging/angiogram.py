@@ -111,7 +111,7 @@ class VesselImage:
         Vessel as an observer draws it, at times less than ``path_mm`` covers; its
         one-pixel-wide centreline; pixels that carry a picture (no collimator).
     kind : str
-        ``path_length``, ``attenuation`` or ``raw``.
+        ``path_length``, ``attenuation``, ``raw`` or ``mask``.
     vesselness : (rows, cols) float32 or None
         Ridge response; None where the picture needed no enhancement.
     catheter : (rows, cols) bool or None

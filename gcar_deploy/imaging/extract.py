@@ -15,6 +15,7 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.fusion import fused
 from gcar_deploy.imaging.learned import learned_vessels
+from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.types import Image, Mask
 
@@ -23,6 +24,8 @@ _log = logging.getLogger(__name__)
 _Grey: TypeAlias = tuple[dict[str, Image], Mask]
 #: polarity is taken from the picture only when one sign answers this much more strongly
 _POLARITY_MARGIN = 1.15
+#: vessels never fill more than this share of a picture
+_FULL = 0.9
 
 
 def extract_vessels(
@@ -36,7 +39,8 @@ def extract_vessels(
         ``path_length``: counts times ``mm_per_count``. ``attenuation``: linear in the path
         with unknown scale, vessels bright. ``raw``: vessels dark unless the polarity says
         otherwise or the picture clearly does; contrast against the filled-in background,
-        scaled by the width of the vessels' shadows.
+        scaled by the width of the vessels' shadows. ``mask``: vessel where above half of the
+        largest value; paths from the vessels' width alone.
     options : ImagingOptions; ``segmenter`` says who finds vessels in grey values
     segmenter : the network, needed for ``net``; without it ``auto`` is ``classic``
 
@@ -49,13 +53,15 @@ def extract_vessels(
     RefusedError
         No vessel: blank, constant, saturated, or nothing that stands out of the noise.
     GeometryError
-        ``path_length`` without ``mm_per_count`` or declared dark.
+        ``path_length`` without ``mm_per_count``; it or ``mask`` declared dark.
     """
     pixels = angiogram.pixels
     if not float(pixels.max()) > float(pixels.min()):
         raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")
     if angiogram.intensity.kind == "path_length":
         return _from_path_length(angiogram, options)
+    if angiogram.intensity.kind == "mask":
+        return _from_mask(angiogram, options)
     if options.segmenter == "net" and angiogram.mask is None:
         segmenter = _needed(segmenter)
     grey = _grey_values(angiogram, options)
@@ -68,7 +74,8 @@ def extract_vessels(
 
 def asks_network(angiograms: Sequence[Angiogram]) -> bool:
     """Whether vessels have to be found in any of these: no path lengths, and no mask given."""
-    return any(a.intensity.kind != "path_length" and a.mask is None for a in angiograms)
+    return any(a.intensity.kind not in ("path_length", "mask") and a.mask is None
+               for a in angiograms)  # fmt: skip
 
 
 def _from_both(
@@ -105,11 +112,7 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
             f"view {angiogram.view_id}: intensity kind path_length needs mm_per_count "
             "(millimetres of vessel per count)"
         )
-    if angiogram.intensity.polarity == "dark":
-        raise GeometryError(
-            f"view {angiogram.view_id}: path_length pictures have bright vessels, "
-            "polarity dark contradicts that; use kind raw or invert the picture"
-        )
+    _refuse_dark(angiogram)
     path = np.asarray(angiogram.pixels * np.float32(scale), dtype=np.float32)
     smallest = options.path_threshold_pixels * angiogram.carm.pixel_at_isocenter_mm
     valid = np.ones(path.shape, bool) if angiogram.valid is None else angiogram.valid
@@ -118,7 +121,7 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
         mask &= angiogram.mask
     if not mask.any():
         raise _nothing(angiogram, f"no path is longer than {smallest:.2g} mm")
-    if mask.mean() > 0.9:
+    if mask.mean() > _FULL:
         raise _nothing(angiogram, "nearly every pixel is full")
     return VesselImage(
         view_id=angiogram.view_id,
@@ -130,6 +133,49 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
         valid=valid,
         kind="path_length",
     )
+
+
+def _from_mask(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+    """Chords of round vessels: no brightness is read."""
+    _refuse_dark(angiogram)
+    valid = np.ones(angiogram.pixels.shape, bool) if angiogram.valid is None else angiogram.valid
+    mask = above_half(angiogram.pixels) & valid
+    if angiogram.mask is not None:
+        mask &= angiogram.mask
+    if mask.mean() > _FULL:
+        raise _nothing(angiogram, "nearly every pixel is full")
+    line = skel.skeletonize(mask)
+    pixel_mm = angiogram.carm.pixel_at_isocenter_mm
+    if line.sum() * pixel_mm < options.min_length_mm:
+        raise _nothing(
+            angiogram,
+            f"{line.sum() * pixel_mm:.0f} mm of line (needed: {options.min_length_mm:g} mm)",
+        )
+    return VesselImage(
+        view_id=angiogram.view_id,
+        carm=angiogram.carm,
+        path_mm=mask_path(mask, pixel_mm),
+        path_error=options.mask_error,
+        mask=mask,
+        skeleton=line,
+        valid=valid,
+        kind="mask",
+    )
+
+
+def above_half(pixels: Image) -> Mask:
+    """Vessel of a picture that is a mask, binary or grey: above half of its largest value."""
+    inside: Mask = pixels > 0.5 * float(pixels.max())
+    return inside
+
+
+def _refuse_dark(angiogram: Angiogram) -> None:
+    kind = angiogram.intensity.kind
+    if angiogram.intensity.polarity == "dark":
+        raise GeometryError(
+            f"view {angiogram.view_id}: {kind} pictures have bright vessels, "
+            "polarity dark contradicts that; use kind raw or invert the picture"
+        )
 
 
 def _grey_values(angiogram: Angiogram, options: ImagingOptions) -> _Grey:

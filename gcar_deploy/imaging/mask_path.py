@@ -51,7 +51,7 @@ def mask_path(mask: Mask, pixel_mm: float) -> Image:
     inside = np.argwhere(mask)
     # Only the box of the vessels is looked at, with room for the blur.
     (r0, c0), (r1, c1) = inside.min(axis=0), inside.max(axis=0) + 1
-    box = cv2.copyMakeBorder(mask[r0:r1, c0:c1].astype(np.float32), 3, 3, 3, 3, cv2.BORDER_CONSTANT)
+    box = np.pad(mask[r0:r1, c0:c1], 3)
     path = _chords(box, parts)
     # A line thinner than what the smoothing leaves is a vessel still.
     line = skel.skeletonize(box)

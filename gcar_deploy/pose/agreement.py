@@ -46,7 +46,9 @@ def agreeing(
     if all(v.calibrated for v in views) or worst <= limits.parts_disagreement_raw:
         return list(views), poses, []
     main = [
-        view if view.calibrated or angiogram.mask is not None else largest_part(view)
+        view
+        if view.calibrated or view.kind == "mask" or angiogram.mask is not None
+        else largest_part(view)
         for angiogram, view in zip(angiograms, views, strict=True)
     ]
     if all(a is b for a, b in zip(main, views, strict=True)):

@@ -59,6 +59,16 @@ def picture(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
     return apply
 
 
+def mask(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    """Say that view 2 is a mask, and change its pixels."""
+
+    def apply(folder: Path) -> None:
+        geometry(("views.1.intensity", {"kind": "mask"}))(folder)
+        picture(make)(folder)
+
+    return apply
+
+
 def raw(change: Callable[[bytes], bytes]) -> Callable[[Path], None]:
     """Change the bytes of view2.png."""
 
@@ -95,6 +105,12 @@ def colour(pixels: np.ndarray) -> np.ndarray:
 def speckle(pixels: np.ndarray) -> np.ndarray:
     out = np.zeros_like(pixels)
     out[10, 10] = 3000
+    return out
+
+
+def nearly_full(pixels: np.ndarray) -> np.ndarray:
+    out = np.full_like(pixels, 60000)
+    out[10, 10] = 0
     return out
 
 
@@ -162,6 +178,9 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "no scale": (geometry(("views.0.intensity.mm_per_count", ...)), 4, "mm_per_count"),
     "scale zero": (geometry(("views.0.intensity.mm_per_count", 0)), 4, "mm_per_count"),
     "dark path lengths": (geometry(("views.0.intensity.polarity", "dark")), 4, "polarity"),
+    "dark mask": (
+        geometry(("views.0.intensity", {"kind": "mask", "polarity": "dark"})), 4, "polarity",
+    ),
     "volume without shape": (geometry(("volume.shape", ...)), 4, "shape"),
     "volume of a fraction": (geometry(("volume.shape", [96, 96, 9.5])), 4, "shape"),
     "volume too fine": (geometry(("volume.shape", [1024, 1024, 1024])), 4, "2^28"),
@@ -177,6 +196,9 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "blank view": (picture(np.zeros_like), 6, "no vessel"),
     "constant view": (picture(lambda p: np.full_like(p, 500)), 6, "no vessel"),
     "saturated view": (picture(lambda p: np.maximum(p, 60000)), 6, "no vessel"),
+    "empty mask": (mask(np.zeros_like), 6, "no vessel"),
+    "full mask": (mask(nearly_full), 6, "nearly every pixel"),
+    "mask of one pixel": (mask(speckle), 6, "mm of line"),
     "both views the same picture": (same_picture, 6, "same picture"),
     "3 degrees apart": (
         geometry(("views.1.primary_angle_deg", -27), ("views.1.secondary_angle_deg", -20)),

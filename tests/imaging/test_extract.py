@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import GeometryError, ImageError, RefusedError
-from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.extract import asks_network, extract_vessels
 from gcar_deploy.imaging.resample import area_average, resized
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, raw_picture, tube_paths
@@ -27,6 +29,36 @@ def test_path_length_is_exact():
     np.testing.assert_allclose(found.path_mm[found.mask], truth[found.mask], atol=6e-4)
     assert (found.path_mm[~found.mask] == 0).all()
     assert not (found.skeleton & ~found.mask).any()
+
+
+@pytest.mark.req("REQ-12")
+def test_a_mask_is_read_above_half_and_nothing_of_its_brightness():
+    truth = tube_paths()
+    binary = extract_vessels(angiogram(truth > 0.5, "mask"), _OPTIONS)
+    np.testing.assert_array_equal(binary.mask, truth > 0.5)
+    assert not binary.calibrated and binary.path_error == _OPTIONS.mask_error
+    assert np.median(binary.path_mm[truth > 1] / truth[truth > 1]) == pytest.approx(1, abs=0.06)
+    # grey: an edge drawn softly, any scale, brightness within that means nothing
+    grey = np.where(truth > 0.5, 120 + 80 * np.random.default_rng(2).random(truth.shape), 40)
+    soft = extract_vessels(angiogram(grey, "mask", polarity="bright"), _OPTIONS)
+    np.testing.assert_array_equal(soft.mask, binary.mask)
+    np.testing.assert_array_equal(soft.path_mm, binary.path_mm)
+
+
+def test_a_users_mask_cuts_a_mask_and_keeps_the_brightness_of_a_picture():
+    truth = tube_paths()
+    half = np.zeros(truth.shape, bool)
+    half[:, :150] = True
+    given = dataclasses.replace(angiogram(truth > 0.5, "mask"), mask=half)
+    np.testing.assert_array_equal(extract_vessels(given, _OPTIONS).mask, (truth > 0.5) & half)
+    grey = dataclasses.replace(angiogram(raw_picture(truth, gain=0.06)), mask=truth > 0.5)
+    found = extract_vessels(grey, _OPTIONS)
+    assert found.kind == "raw" and found.path_error == _OPTIONS.contrast_error
+
+
+def test_masks_need_no_network():
+    assert not asks_network([angiogram(tube_paths() > 0.5, "mask")])
+    assert asks_network([angiogram(raw_picture(tube_paths()))])
 
 
 def test_thin_vessel_survives_in_coarse_path_lengths():
