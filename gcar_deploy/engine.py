@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import logging
 import os
 import threading
 import time
@@ -14,39 +13,27 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import PictureLimits, PredictOptions, RunOptions, check_options
+from gcar_deploy.config import PictureLimits, RunOptions, check_options
 from gcar_deploy.config.ranges import Range, check_number
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
-from gcar_deploy.errors import GeometryError, ImageError, ModelError, UsageError
+from gcar_deploy.errors import GeometryError, ImageError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half, asks_network
-from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
-from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.imaging.net import Segmenter, check_segmenter, load_segmenter
 from gcar_deploy.imaging.read import read_picture
-from gcar_deploy.models.golden import check_golden
-from gcar_deploy.models.spec import (
-    SEGMENTER_MODEL,
-    SHIPPED,
-    read_model,
-    shipped_model_path,
-)
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.center_predictor import Predictor, open_predictor
+from gcar_deploy.predict.center_predictor import load_predictor, missing_predictor
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
-
-_log = logging.getLogger(__name__)
 
 #: a file, an array of counts, or a picture that already knows its C-arm
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
 #: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
 Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
-SEGMENTERS = ("classic", "net", "auto")
-PREDICTORS = ("auto", "multi", "single", "none")
 _DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 
 
@@ -82,10 +69,11 @@ class Engine:
         if threads is not None:
             check_number("threads", threads, int, Range(1, 256))
         self.threads = threads or min(os.cpu_count() or 1, 4)
-        self._predictor = _load(model, self.options.predict, self.threads, session)
+        wanted = self.options.predict
+        self._predictor = load_predictor(model, wanted, threads=self.threads, session=session)
         self._notes: tuple[str, ...] = ()
-        if self._predictor is None and self.options.predict.predictor != "none":
-            self._notes = (_missing(self.options.predict.predictor),)
+        if self._predictor is None and wanted.predictor != "none":
+            self._notes = (missing_predictor(wanted.predictor),)
         check_segmenter(self.options.imaging.segmenter)
         self._segmenter: Segmenter | None = None
         self._segmenter_lock = threading.Lock()
@@ -97,7 +85,7 @@ class Engine:
         """Name and SHA-256 of the loaded model; None without one."""
         if self._predictor is None:
             return None
-        return {"name": self._predictor.model.name, "sha256": self._predictor.model.sha256}
+        return self._predictor.model.label
 
     def warmup(self) -> float:
         """Run a small generated case once, so that the next call finds everything loaded.
@@ -261,35 +249,6 @@ def with_masks(
     return out
 
 
-def check_segmenter(wanted: str) -> None:
-    """Raise UsageError where nobody of that name finds vessels."""
-    if wanted not in SEGMENTERS:
-        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(SEGMENTERS)}")
-
-
-def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
-    """Load the network that finds vessels where ``wanted`` needs it.
-
-    Raises
-    ------
-    UsageError
-        ``wanted`` is unknown.
-    ModelError
-        ``net`` is wanted and the network is missing or altered.
-    """
-    check_segmenter(wanted)
-    path = shipped_model_path(SEGMENTER_MODEL)
-    if wanted == "classic" or (path is None and wanted == "auto"):
-        return None
-    if path is None:
-        raise ModelError("no segmentation network is installed with this version; use classic")
-    model = read_model(path, wanted=SEGMENTER_INPUT)
-    segmenter = Segmenter(model.data, model.name, threads=threads)
-    if model.golden is not None:
-        check_golden(model.name, model.golden, segmenter.run, model.limits)
-    return segmenter
-
-
 def _from_headers(
     views: Sequence[Picture], options: RunOptions
 ) -> tuple[list[Angiogram], Grid, list[str]]:
@@ -358,32 +317,3 @@ def _scene(geometry: Geometry) -> Scene:
     if isinstance(geometry, (str, Path)):
         return load_scene(geometry)
     raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")
-
-
-def _load(
-    model: str | Path | None, options: PredictOptions, threads: int, session: Any
-) -> Predictor | None:
-    wanted = options.predictor
-    if wanted not in PREDICTORS:
-        raise UsageError(f"predictor = {wanted!r} is none of {', '.join(PREDICTORS)}")
-    if wanted == "none":
-        if model is not None:
-            raise UsageError("predictor none uses no model; leave the model away")
-        return None
-    path = shipped_model_path(_shipped(wanted)) if model is None else Path(model)
-    if path is None:
-        _log.info("%s", _missing(wanted))
-        return None
-    file = read_model(path, options.limits)
-    if wanted not in ("auto", file.kind):
-        raise ModelError(f"model {file.name} is of kind {file.kind}, not {wanted}")
-    return open_predictor(file, threads=threads, session=session)
-
-
-def _shipped(wanted: str) -> str:
-    """Name of the model that a predictor uses unless one is given."""
-    return SHIPPED["multi" if wanted == "auto" else wanted]
-
-
-def _missing(wanted: str) -> str:
-    return f"{_shipped(wanted)}.onnx is not installed: the visual hull was thinned instead"

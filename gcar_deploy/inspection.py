@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import RunOptions, check_options
-from gcar_deploy.engine import load_segmenter, prepare
+from gcar_deploy.engine import prepare
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import asks_network, extract_vessels
+from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
+from gcar_deploy.imaging.net import load_segmenter
 from gcar_deploy.pose.agreement import agreeing, check_consistency, order_of, with_hint
 from gcar_deploy.quality.gates import check_views
 
@@ -94,7 +95,9 @@ def inspect_files(
         found.silent += silent_errors(carms)
         found.warnings += check_views(angiograms, options.quality)
         wanted = options.imaging.segmenter if asks_network(angiograms) else "classic"
-        views, segmenter = [], load_segmenter(wanted)
+        views, loaded = [], load_segmenter(wanted)
+        segmenter, missing = asked_network(angiograms, options.imaging, loaded)
+        found.warnings += missing
         for entry, angiogram in zip(found.views, angiograms, strict=True):
             view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())

@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy.config import RunOptions, check_options
-from gcar_deploy.errors import CancelledError, NumericalError, UsageError
+from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.extract import asked_network, extract_vessels
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.output.result import Result
@@ -100,7 +100,9 @@ def reconstruct(
                       used_s=used_s)  # fmt: skip
     findings = quality.check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        views = _vessels(angiograms, options, segmenter, report, watch)
+        used, missing = asked_network(angiograms, options.imaging, segmenter)
+        findings += missing
+        views = _vessels(angiograms, options, used, report, watch)
     with watch.stage("pose"):
         views, poses, apart = agreeing(angiograms, views, options)
         findings += apart
@@ -166,8 +168,8 @@ def reconstruct(
             "rejected_steps": refined.rejected_steps, "alternatives": len(open_),
         },
         losses=tuple(refined.losses), predictor=centers.source, refiner=how.refiner,
-        model=None if predictor is None
-        else {"name": predictor.model.name, "sha256": predictor.model.sha256},
+        model=None if predictor is None else predictor.model.label,
+        segmenter=None if used is None else used.session.model.label,
         notes=(), options=options,
     )  # fmt: skip
 
@@ -200,24 +202,20 @@ def _centers(
     """Which of the hull's points are vessel, and what the multi-view predictor said of each."""
     if predictor is None:
         return thin_hull(hull, encoded, options.candidates), None
-    stop = watch.should_stop if watch.interruptible else None
-    try:
-        if isinstance(predictor, SingleViewPredictor):
-            alone = predictor.predict([(view.carm, view.path_mm) for view in views], stop)
-            single = options.predict.single
-            return merge_views(alone, hull, encoded, options.candidates, single), None
-        told = predictor.predict(hull, encoded, stop)
-        others = []
-        for look in range(1, options.predict.looks):
-            lattice = shifted_lattice(hull.lattice, look)
-            near = near_evidence(hull, told.confidence, look, options.predict.look_again)
-            other = visual_hull([(c, p) for c, p, _ in known], lattice, options.candidates, near)
-            if len(other):
-                others.append((other, predictor.predict(other, encode(other, known), stop)))
-        told = mean_evidence(told, others)
-    except CancelledError:
-        watch.check()
-        raise
+    stop = watch.question
+    if isinstance(predictor, SingleViewPredictor):
+        alone = predictor.predict([(view.carm, view.path_mm) for view in views], stop)
+        single = options.predict.single
+        return merge_views(alone, hull, encoded, options.candidates, single), None
+    told = predictor.predict(hull, encoded, stop)
+    others = []
+    for look in range(1, options.predict.looks):
+        lattice = shifted_lattice(hull.lattice, look)
+        near = near_evidence(hull, told.confidence, look, options.predict.look_again)
+        other = visual_hull([(c, p) for c, p, _ in known], lattice, options.candidates, near)
+        if len(other):
+            others.append((other, predictor.predict(other, encode(other, known), stop)))
+    told = mean_evidence(told, others)
     error = max(view.path_error for view in views)
     return decide(told, encoded, error, options.decide), told
 
@@ -230,6 +228,7 @@ def _vessels(
     watch: Stopwatch,
 ) -> list[VesselImage]:
     views = []
+    segmenter = segmenter and segmenter.watched(watch.question)
     for angiogram in angiograms:
         watch.check()
         views.append(extract_vessels(angiogram, options.imaging, segmenter))

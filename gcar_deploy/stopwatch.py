@@ -66,14 +66,15 @@ class Stopwatch:
         """Whether the caller wants out."""
         return self._cancel is not None and self._cancel()
 
-    @property
-    def interruptible(self) -> bool:
-        """Whether there is a deadline or a way to cancel at all."""
-        return self._deadline_s is not None or self._cancel is not None
-
     def should_stop(self) -> bool:
         """Whether an iteration should end with what it has."""
         return self.late or self.cancelled
+
+    @property
+    def question(self) -> Callable[[], bool] | None:
+        """``should_stop``, or None where there is neither a deadline nor a way to cancel."""
+        asked = self._deadline_s is not None or self._cancel is not None
+        return self.should_stop if asked else None
 
     @property
     def left_s(self) -> float:
@@ -117,7 +118,8 @@ class Stopwatch:
         Raises
         ------
         CancelledError
-            Before the stage: cancelled, or late unless ``keep_if_late``.
+            Before the stage: cancelled, or late unless ``keep_if_late``. Within it: what a
+            running model raises becomes the sentence of ``check``.
         """
         if self.cancelled or not keep_if_late:
             self.check()
@@ -129,7 +131,11 @@ class Stopwatch:
 
         report(0.0)
         start = time.perf_counter()
-        yield report
+        try:
+            yield report
+        except CancelledError:
+            self.check()
+            raise
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
         _log.debug("%s: %.3f s", name, self.seconds[name])
         report(1.0)

@@ -82,7 +82,7 @@ def test_eight_threads_share_the_shipped_model_to_the_byte(case, request):
 
 def test_an_existing_session_is_used_as_it_is(case):
     ort = pytest.importorskip("onnxruntime")
-    from gcar_deploy.models.spec import shipped_model_path
+    from gcar_deploy.predict.kinds import MULTI
 
     angiograms, grid, _ = case
     ran = []
@@ -92,7 +92,7 @@ def test_an_existing_session_is_used_as_it_is(case):
             ran.append(self)
             return super().run(*arguments)
 
-    session = Session(str(shipped_model_path()), providers=["CPUExecutionProvider"])
+    session = Session(str(MULTI.path), providers=["CPUExecutionProvider"])
     engine = Engine(session=session)
     assert content(engine.reconstruct(angiograms, grid)) == content(
         Engine().reconstruct(angiograms, grid)
@@ -102,9 +102,9 @@ def test_an_existing_session_is_used_as_it_is(case):
 
 def test_a_running_inference_is_cut(case, monkeypatch):
     """Asked from another thread, since inference holds the calling one."""
-    from gcar_deploy.predict import center_predictor
+    from gcar_deploy.models import session
 
-    monkeypatch.setattr(center_predictor, "WATCH_S", 1e-4)
+    monkeypatch.setattr(session, "WATCH_S", 1e-4)
     angiograms, grid, _ = case
     stage, askers = [""], set()
 

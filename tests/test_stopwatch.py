@@ -41,7 +41,7 @@ def test_leaving_keeps_its_reserve_and_used_time_counts(clock):
 def test_without_a_deadline_there_is_all_the_time(clock):
     watch = Stopwatch((("a", 1.0),))
     clock.s += 1e9
-    assert not watch.leaving(1e9)() and not watch.interruptible
+    assert not watch.leaving(1e9)() and watch.question is None
     watch.require(1e9)
 
 
@@ -49,7 +49,7 @@ def test_asking_after_cancel_raises(clock):
     wishes = iter((False, True, True))
     watch = Stopwatch((("a", 1.0),), cancel=lambda: next(wishes))
     stop = watch.leaving(1.0)
-    assert watch.interruptible and not stop()
+    assert watch.question is not None and not stop()
     with pytest.raises(CancelledError, match="by the caller"):
         stop()
 

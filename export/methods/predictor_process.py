@@ -17,8 +17,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import open_predictor
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.types import Array
 
 #: inferences in the process; memory that is not given back shows after the first
@@ -47,9 +47,9 @@ def main(model: Path, file: Path) -> dict[str, float]:
     """Run the feed a few times; return the peak of this process."""
     with np.load(file) as data:
         feed = dict(data)
-    predictor = open_predictor(read_model(model), threads=2)
+    predictor = open_predictor(read_predictor(model), threads=2)
     for _ in range(RUNS):
-        predictor.answers(feed)
+        predictor.session.answers(feed)
     return {"peak_mib": _peak_mib()}
 
 

@@ -192,10 +192,10 @@ class MethodSettings:
 @functools.cache
 def _model_hashes(predictor: str) -> dict[str, str]:
     """SHA-256 of the shipped models that a predictor may use, by file name."""
-    from gcar_deploy.models.spec import shipped_model_path
+    from gcar_deploy.predict.kinds import PREDICTORS
 
     kinds = {"auto": ("multi",), "none": ()}.get(predictor, (predictor,))
-    paths = [shipped_model_path(f"gcp-{kind}") for kind in kinds]
+    paths = [PREDICTORS[kind].path for kind in kinds]
     return {p.name: _sha256(p) for p in paths if p is not None}
 
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import INPUT, OUTPUTS, STRIDE, Segmenter
+from gcar_deploy.imaging.net import INPUT, KIND, OUTPUTS, STRIDE, open_segmenter
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
@@ -124,7 +124,7 @@ def _write_spec(checkpoint: Path, out: Path, net: torch.nn.Module) -> None:
     spec = {
         "schema": "gcar-model/1",
         "name": out.stem,
-        "kind": "segmenter",
+        "kind": KIND.name,
         "inputs": dict(INPUT),
         "outputs": list(OUTPUTS),
         "opset": OPSET,
@@ -139,7 +139,7 @@ def _write_spec(checkpoint: Path, out: Path, net: torch.nn.Module) -> None:
 
 
 def _largest_difference(net: torch.nn.Module, out: Path, pictures: int) -> float:
-    session = Segmenter(out.read_bytes(), out.stem, threads=1)
+    session = open_segmenter(out, threads=1)
     worst = 0.0
     for k in range(pictures):
         channels = training_pair(PARITY_SEED, k, ImagingOptions())[0]

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from gcar_deploy.config import CandidateOptions, ModelLimits
 from gcar_deploy.errors import UsageError
-from gcar_deploy.imaging.net import INPUT as SEGMENTER_INPUT
-from gcar_deploy.imaging.net import Segmenter
-from gcar_deploy.models.golden import Golden, check_golden, golden_path
-from gcar_deploy.models.spec import ModelFile, read_model
+from gcar_deploy.imaging.net import KIND as SEGMENTER
+from gcar_deploy.imaging.net import open_segmenter
+from gcar_deploy.models import (
+    Golden,
+    ModelFile,
+    Session,
+    check_golden,
+    golden_path,
+    read_model,
+)
 from gcar_deploy.predict.center_map import net_picture
 from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.encoding import encode, flat_inputs, input_names
 from gcar_deploy.predict.hull import Candidates, visual_hull
+from gcar_deploy.predict.kinds import PREDICTORS
 from gcar_deploy.selftest import tiny_case
 
 #: points of the case: enough for every level and for rays of several points, small on disk
 POINTS = 500
-SEGMENTER = "segmenter"
-_Answers = Callable[[Mapping[str, np.ndarray]], Mapping[str, np.ndarray]]
 
 
 def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
@@ -30,7 +34,7 @@ def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
     angiograms, grid, _ = tiny_case()
     # path_length pictures: counts times mm per count
     views = [(a.carm, a.pixels * np.float32(a.intensity.mm_per_count)) for a in angiograms]
-    if model.kind == SEGMENTER:
+    if model.kind == SEGMENTER.name:
         shape = (1, int(model.inputs["channels"]), 64, 64)
         noise = np.random.default_rng(0).normal(size=shape)
         return {"channels": np.clip(noise, -1, 2).astype(np.float32)}
@@ -63,10 +67,10 @@ def write_golden(model: Path, *, force: bool = False) -> Path:
         # A golden case of an earlier model would be refused with it.
         path.replace(old)
     try:
-        file, answers_to = _opened(model)
-        inputs = golden_inputs(file)
-        answers = answers_to(inputs)
-        golden = Golden(file.sha256, inputs, answers)
+        session = _opened(model)
+        inputs = golden_inputs(session.model)
+        answers = session.answers(inputs)
+        golden = Golden(session.model.sha256, inputs, answers)
         path.write_bytes(golden.to_bytes())
         check_golden(model.name, golden, lambda names, feed: list(answers.values()), ModelLimits())
     except BaseException:
@@ -78,12 +82,9 @@ def write_golden(model: Path, *, force: bool = False) -> Path:
     return path
 
 
-def _opened(path: Path) -> tuple[ModelFile, _Answers]:
-    """Read a model of any kind; return what runs its graph on named inputs."""
-    file = read_model(path, wanted={})
-    if file.kind != SEGMENTER:
-        predictor = open_predictor(read_model(path), threads=1)
-        return predictor.model, predictor.answers
-    network = Segmenter(read_model(path, wanted=SEGMENTER_INPUT).data, file.name, threads=1)
-    names = network.output_names()
-    return file, lambda feed: dict(zip(names, network.run(names, feed), strict=True))
+def _opened(path: Path) -> Session:
+    """Open a model of any kind."""
+    file = read_model(path, (*PREDICTORS.values(), SEGMENTER))
+    if file.kind == SEGMENTER.name:
+        return open_segmenter(path, threads=1).session
+    return open_predictor(file, threads=1).session

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.encoding import Encoded, flat_inputs
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.types import Array
 from gcar_export.shipping.export_onnx import (
     DeployedSparse,
@@ -151,10 +151,10 @@ def export_checked(checkpoint: Path, out: Path, inputs: int = 60, task_scenes: i
             found = dataclasses.replace(
                 found,
                 task_torch=task_measure(torch_predictor(checkpoint, partial), task_scenes),
-                task_runtime=task_measure(read_model(partial), task_scenes),
+                task_runtime=task_measure(read_predictor(partial), task_scenes),
             )
         accept(out.name, found)
-        spec = read_model(partial).spec
+        spec = read_predictor(partial).spec
         os.replace(partial, out)
         finish(out, {**spec, "name": out.stem})
         write_golden(out, force=True)

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.errors import ModelError
+from gcar_deploy.models import ModelFile
 from gcar_deploy.models.golden import golden_path
-from gcar_deploy.models.spec import ModelFile, read_model
 from gcar_deploy.predict.encoding import flat_inputs, input_names
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.types import Array
 from gcar_export.shipping.export_onnx import finish
 from gcar_export.shipping.golden import write_golden
@@ -63,7 +64,7 @@ def quantize(path: Path, out: Path, calibration: int = 16) -> ModelFile:
     from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
-    model = read_model(path)
+    model = read_predictor(path)
     reader = _Calibration(model, calibration)
     CalibrationDataReader.register(_Calibration)
     with tempfile.TemporaryDirectory(prefix="gcar-int8-") as folder:
@@ -85,7 +86,7 @@ def quantize(path: Path, out: Path, calibration: int = 16) -> ModelFile:
     spec |= {"name": out.stem, "precision": f"int8, calibrated on {calibration} generated scenes"}
     finish(out, spec)
     write_golden(out, force=True)
-    return read_model(out)
+    return read_predictor(out)
 
 
 def quantize_checked(path: Path, scenes: int = 12, calibration: int = 16) -> str:
@@ -103,7 +104,7 @@ def quantize_checked(path: Path, scenes: int = 12, calibration: int = 16) -> str
     out = path.with_name(f"{path.stem}-int8.onnx")
     try:
         small = quantize(path, out, calibration)
-        before, after = (task_measure(m, scenes) for m in (read_model(path), small))
+        before, after = (task_measure(m, scenes) for m in (read_predictor(path), small))
         lost = (before - after) / max(before, 1e-9)
         figures = (
             f"Dice {before:.4f} -> {after:.4f} over {scenes} scenes ({-lost:+.2%}), "

@@ -15,13 +15,14 @@ import numpy as np
 import torch
 
 from gcar_deploy.config import RunOptions
-from gcar_deploy.models.spec import ModelFile, read_model
+from gcar_deploy.models import ModelFile
 from gcar_deploy.predict.center_predictor import (
     Predictor,
     SingleViewPredictor,
     open_predictor,
 )
 from gcar_deploy.predict.decision import decide
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.types import Scalars
 from gcar_export.shipping.export_onnx import deployed, graph_inputs
@@ -76,7 +77,7 @@ class _TorchSession:
 
 def torch_predictor(checkpoint: Path, model: Path) -> Predictor:
     """Return the runtime's predictor with torch in place of ONNX Runtime."""
-    file = dataclasses.replace(read_model(model), golden=None)
+    file = dataclasses.replace(read_predictor(model), golden=None)
     return open_predictor(file, session=_TorchSession(deployed(checkpoint)))
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import open_predictor
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_export.shipping.task_check import scores
 
 
@@ -21,12 +21,12 @@ def verify_model(path: Path, scenes: int) -> str:
     """
     from gcar_deploy.cli.model_card import card
 
-    model = read_model(path)
+    model = read_predictor(path)
     dice: dict[str, list[float]] = {}
     for kind, score in scores(model, scenes):
         dice.setdefault(kind, []).append(score)
     lines = card(model)
-    worst = open_predictor(model, threads=1).check_golden()
+    worst = open_predictor(model, threads=1).session.check_golden()
     lines.append(
         "no golden case beside it"
         if worst is None

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.errors import UsageError
-from gcar_deploy.models.spec import SHIPPED, read_model, shipped_model_path
 from gcar_deploy.predict.center_map import net_picture
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor, open_predictor
 from gcar_deploy.predict.encoding import flat_inputs
+from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
 from gcar_deploy.types import Array
 from gcar_export.evaluate.evaluate import find_labels
 from gcar_export.evaluate.protocols import Case, make_case
@@ -74,10 +74,10 @@ def open_models(names: Sequence[str]) -> list[tuple[Path, Predictor]]:
     """
     out = []
     for name in names:
-        path = shipped_model_path(SHIPPED[name]) if name in SHIPPED else Path(name)
+        path = PREDICTORS[name].path if name in PREDICTORS else Path(name)
         if path is None:
             raise UsageError(f"no {name} model is installed; give the path of one")
-        out.append((path, open_predictor(read_model(path))))
+        out.append((path, open_predictor(read_predictor(path))))
     return out
 
 

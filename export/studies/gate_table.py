@@ -34,11 +34,11 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import QualityOptions, RunOptions
-from gcar_deploy.engine import Engine, load_segmenter
+from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.imaging.net import Segmenter, load_segmenter
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.measure.metrics import volume_dice
 from gcar_deploy.pose import agreement

@@ -18,16 +18,14 @@ import cv2
 import numpy as np
 
 from gcar_deploy.config import ImagingOptions
-from gcar_deploy.engine import load_segmenter
 from gcar_deploy.errors import ModelError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import DEFAULT_FIELD_MM, Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.imaging.net import INPUT, Segmenter
+from gcar_deploy.imaging.net import Segmenter, load_segmenter, open_segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.skeleton import skeletonize
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.types import Image, Mask
 
 #: truth of the R_ cases: rays that cross at least this much vessel
@@ -60,7 +58,7 @@ def find(data: Path, name: str) -> Path:
 def network(path: Path | None) -> Segmenter:
     """Load the segmentation network from a file, or the one that comes along."""
     if path is not None:
-        return Segmenter(read_model(path, wanted=INPUT).data, path.stem, threads=1)
+        return open_segmenter(path, threads=1)
     found = load_segmenter("net", 1)
     if found is None:
         raise ModelError("no segmentation network is installed")

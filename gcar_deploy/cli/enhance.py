@@ -74,11 +74,11 @@ def enhance(
     from gcar_deploy.config import DicomOptions, ImagingOptions
     from gcar_deploy.dicom.header import is_dicom
     from gcar_deploy.dicom.scene import read_run
-    from gcar_deploy.engine import load_segmenter
     from gcar_deploy.errors import UsageError
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
-    from gcar_deploy.imaging.extract import extract_vessels
+    from gcar_deploy.imaging.extract import asked_network, extract_vessels
+    from gcar_deploy.imaging.net import load_segmenter
     from gcar_deploy.imaging.pictures import png_files
     from gcar_deploy.imaging.read import read_picture
     from gcar_deploy.output.folder import check_target, write_folder
@@ -99,7 +99,9 @@ def enhance(
     pictures: dict[str, bytes] = {}
     for who in ("classic", "net") if segmenter == "both" else (segmenter,):
         chosen = dataclasses.replace(options, segmenter=who)
-        found = extract_vessels(angiogram, chosen, load_segmenter(who))
+        network, missing = asked_network([angiogram], chosen, load_segmenter(who))
+        click.echo("".join(f"gcar: {note}\n" for note in missing), err=True, nl=False)
+        found = extract_vessels(angiogram, chosen, network)
         prefix = "net_" if (segmenter, who) == ("both", "net") else ""
         pictures |= {prefix + name: p for name, p in png_files(found).items()}
     write_folder(out_dir, pictures, force=force)

@@ -27,9 +27,9 @@ def info(path: Path, as_json: bool) -> None:
 
     if path.suffix == ".onnx":
         from gcar_deploy.cli.model_card import card
-        from gcar_deploy.models.spec import read_model
+        from gcar_deploy.predict.kinds import read_predictor
 
-        model = read_model(path)
+        model = read_predictor(path)
         click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))
         return
     summary = read_result(path)
@@ -99,16 +99,19 @@ def names_of(branches: list[dict[str, Any]]) -> str:
 def lines(path: Path, summary: dict[str, Any]) -> list[str]:
     """Return the summary for people."""
     tree, counts = summary["tree"], summary["counts"]
-    model = summary["model"]
+    made_by = {  # results of earlier versions do not name the segmenter
+        key: "none" if summary.get(key) is None
+        else f"{summary[key]['name']} {summary[key]['sha256'][:12]}"
+        for key in ("model", "segmenter")
+    }  # fmt: skip
     out = [
         f"{path}: {summary['status']}",
         f"  {summary['sentence']}",
         f"  tree: {len(tree['branches'])} branches, {tree['length_mm']:.0f} mm, "
         f"{counts['gaussians']} Gaussians",
         f"  names: {names_of(tree['branches'])}",
-        f"  made by: {summary['predictor']} + {summary['refiner']}, model "
-        + ("none" if model is None else f"{model['name']} {model['sha256'][:12]}")
-        + f", gcar {summary['versions'].get('gcar')}",
+        f"  made by: {summary['predictor']} + {summary['refiner']}, model {made_by['model']}, "
+        f"segmenter {made_by['segmenter']}, gcar {summary['versions'].get('gcar')}",
         f"  views {summary['separation_deg']:.1f} deg apart; {summary['seconds']['total']:.2f} s",
     ]
     for view in summary["views"]:

@@ -16,7 +16,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.fusion import fused
 from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
-from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
@@ -76,6 +76,15 @@ def asks_network(angiograms: Sequence[Angiogram]) -> bool:
     """Whether vessels have to be found in any of these: no path lengths, and no mask given."""
     return any(a.intensity.kind not in ("path_length", "mask") and a.mask is None
                for a in angiograms)  # fmt: skip
+
+
+def asked_network(
+    angiograms: Sequence[Angiogram], options: ImagingOptions, segmenter: Segmenter | None
+) -> tuple[Segmenter | None, list[str]]:
+    """Return the network if any of these is asked of it, and what there is to say if it misses."""
+    if options.segmenter == "classic" or not asks_network(angiograms):
+        return None, []
+    return segmenter, [] if segmenter or options.segmenter == "net" else [MISSING]
 
 
 def _from_both(

@@ -10,21 +10,27 @@ and a round vessel is as deep as it is wide.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from gcar_deploy.config import ImagingOptions
-from gcar_deploy.errors import ModelError, NumericalError
+from gcar_deploy.errors import ModelError, UsageError
 from gcar_deploy.imaging import enhance
+from gcar_deploy.models import Kind, Session, read_model
 from gcar_deploy.types import Array, Image, Mask
 
 #: sides of the network's input are multiples of this
 STRIDE = 16
 #: what the spec of a fitting model says of its input
 INPUT = {"channels": 3, "stride": STRIDE}
+KIND = Kind("segmenter", "segmenter", INPUT)
+#: who finds vessels in grey values
+CHOICES = ("classic", "net", "auto")
+#: finding where ``auto`` has no network
+MISSING = f"{KIND.shipped}.onnx is not installed: vessels were found by the classical method alone"
 OUTPUTS = ("probability", "chord")
 #: the second flattening is this much wider than the first: borders of lung and heart stay
 _WIDER = 4.0
@@ -79,52 +85,22 @@ class Seen:
     chord: Image
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class Segmenter:
-    """A warm session of the segmentation network; safe to share between threads.
+    """The segmentation network; safe to share between threads.
 
-    Parameters
+    Attributes
     ----------
-    data : bytes of the ONNX file
-    name : str, for messages
-    threads : int, within one inference
+    session : models.Session of it
+    should_stop : ends a running inference, see ``models.Session.run``; None lets it run
     """
 
-    def __init__(self, data: bytes, name: str, *, threads: int = 2) -> None:
-        import onnxruntime as ort
+    session: Session
+    should_stop: Callable[[], bool] | None = None
 
-        self.name = name
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        options.enable_cpu_mem_arena = False
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        try:
-            self._session: Any = ort.InferenceSession(
-                data, options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-            raise ModelError(f"model {name} does not load: {reason}") from None
-
-    def run(self, outputs: Sequence[str] | None, feed: Mapping[str, Array]) -> list[Array]:
-        """Run the graph on named inputs.
-
-        Raises
-        ------
-        ModelError
-            It cannot run on them.
-        """
-        try:
-            found: list[Array] = self._session.run(outputs, dict(feed))
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-            raise ModelError(f"model {self.name} fails: {reason}") from None
-        return found
-
-    def output_names(self) -> list[str]:
-        """Names of the graph's outputs."""
-        return [node.name for node in self._session.get_outputs()]
+    def watched(self, should_stop: Callable[[], bool] | None) -> Segmenter:
+        """Return the same network, whose inference ends soon after ``should_stop`` says so."""
+        return dataclasses.replace(self, should_stop=should_stop)
 
     def look(self, channels: Array) -> Seen:
         """Return what the network sees in a picture.
@@ -135,16 +111,54 @@ class Segmenter:
 
         Raises
         ------
-        NumericalError
-            The model returned what is not finite.
+        ModelError, NumericalError, CancelledError
+            As ``models.Session.run``.
         """
         _, rows, cols = channels.shape
         down, right = -rows % STRIDE, -cols % STRIDE
         padded = np.stack(
             [cv2.copyMakeBorder(c, 0, down, 0, right, cv2.BORDER_REPLICATE) for c in channels]
         )
-        maps = self.run(list(OUTPUTS), {"channels": padded[None]})
-        for out in maps:
-            if out.shape != (1, 1, rows + down, cols + right) or not np.isfinite(out).all():
-                raise NumericalError(f"model {self.name} returned values that are not finite")
+        shape = (1, 1, rows + down, cols + right)
+        maps = self.session.run(
+            {"channels": padded[None]}, [shape] * len(OUTPUTS),
+            outputs=OUTPUTS, should_stop=self.should_stop,
+        )  # fmt: skip
         return Seen(*(np.ascontiguousarray(m[0, 0, :rows, :cols], np.float32) for m in maps))
+
+
+def open_segmenter(path: Path, *, threads: int = 2) -> Segmenter:
+    """Read, verify and open a segmentation network.
+
+    Raises
+    ------
+    ModelError
+        As ``models.read_model`` and ``models.Session``.
+    """
+    model = read_model(path, (KIND,))
+    return Segmenter(Session(model, ["channels"], threads=threads, arena=False))
+
+
+def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
+    """Open the shipped network where ``wanted`` needs it; None where ``auto`` finds none.
+
+    Raises
+    ------
+    UsageError
+        Nobody of that name finds vessels.
+    ModelError
+        ``net`` is wanted and the network is missing, or it is altered.
+    """
+    check_segmenter(wanted)
+    path = KIND.path
+    if wanted == "classic" or (path is None and wanted == "auto"):
+        return None
+    if path is None:
+        raise ModelError("no segmentation network is installed with this version; use classic")
+    return open_segmenter(path, threads=threads)
+
+
+def check_segmenter(wanted: str) -> None:
+    """Raise UsageError where nobody of that name finds vessels."""
+    if wanted not in CHOICES:
+        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(CHOICES)}")

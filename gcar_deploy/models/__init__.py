@@ -1,1 +1,17 @@
-"""Models: read, guarded and checked before anything of them runs."""
+"""Models: read, guarded and checked before anything of them runs; every network alike."""
+
+from gcar_deploy.models.golden import Golden, check_golden, golden_path, read_golden
+from gcar_deploy.models.session import Session
+from gcar_deploy.models.spec import Kind, ModelFile, read_model, shipped_model_path
+
+__all__ = [
+    "Golden",
+    "Kind",
+    "ModelFile",
+    "Session",
+    "check_golden",
+    "golden_path",
+    "read_golden",
+    "read_model",
+    "shipped_model_path",
+]

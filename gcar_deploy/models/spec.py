@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,23 +15,33 @@ from gcar_deploy.files import read_bounded
 from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.models.golden import Golden, read_golden
 from gcar_deploy.models.guard import check_onnx
-from gcar_deploy.predict.center_map import DEPTH_PIXELS, MAX_PATH_PIXELS, OFFSET_PIXELS
-from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES
 
 SCHEMA = "gcar-model/1"
-#: the shipped centre predictor of each kind; ``multi`` is what ``gcar run`` uses unless told
-SHIPPED = {"multi": "gcp-multi", "single": "gcp-single"}
-DEFAULT_MODEL = SHIPPED["multi"]
-#: name of the network that finds vessels in raw pictures
-SEGMENTER_MODEL = "segmenter"
-_WANTED: dict[str, dict[str, float]] = {
-    "multi": {"view_features": VIEW_FEATURES, "levels": LEVELS},
-    "single": {
-        "depth_pixels": DEPTH_PIXELS,
-        "offset_pixels": OFFSET_PIXELS,
-        "max_path_pixels": MAX_PATH_PIXELS,
-    },
-}
+_PLACE = "gcar_models"
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """What this version gives to models of one kind; the room that uses them says it.
+
+    Attributes
+    ----------
+    name : str, what a spec calls the kind
+    shipped : str, name of the model of this kind that comes along
+    inputs : what a spec must say of ``inputs``
+    unfit : says of a spec's ``inputs`` what else is not understood, as the end of the sentence
+        "model NAME ..."; empty where all is
+    """
+
+    name: str
+    shipped: str
+    inputs: Mapping[str, float]
+    unfit: Callable[[Mapping[str, Any]], str] | None = None
+
+    @property
+    def path(self) -> Path | None:
+        """Where the model that comes along lies; None where it is not installed."""
+        return shipped_model_path(self.shipped)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +67,7 @@ class ModelFile:
 
     @property
     def kind(self) -> str:
-        """``multi`` (all views at once), ``single`` (one view at a time), or another network's."""
+        """Which network it is, as its spec says; one of the kinds it was read for."""
         return str(self.spec.get("kind"))
 
     @property
@@ -65,29 +75,32 @@ class ModelFile:
         """What the model wants, as its spec says."""
         return dict(self.spec["inputs"])
 
+    @property
+    def label(self) -> dict[str, str]:
+        """Name and SHA-256: what results say of it."""
+        return {"name": self.name, "sha256": self.sha256}
 
-def shipped_model_path(name: str = DEFAULT_MODEL) -> Path | None:
+
+def shipped_model_path(name: str) -> Path | None:
     """Where the wheel keeps the model ``name``, or None if it does not ship it."""
-    path = Path(str(resources.files("gcar_models"))) / f"{name}.onnx"
+    path = Path(str(resources.files(_PLACE))) / f"{name}.onnx"
     return path if path.is_file() else None
 
 
-def read_model(
-    path: Path, limits: ModelLimits | None = None, wanted: Mapping[str, Any] | None = None
-) -> ModelFile:
+def read_model(path: Path, kinds: Sequence[Kind], limits: ModelLimits | None = None) -> ModelFile:
     """Read and verify an ONNX file and the spec beside it; nothing of the model is run.
 
     Parameters
     ----------
     path : of the ``.onnx``; its ``.json`` and, where there is one, its ``.golden.npz`` lie beside
+    kinds : of model that the caller can use
     limits : ModelLimits, optional
-    wanted : what its spec must say of ``inputs``; by default those of a centre predictor
 
     Raises
     ------
     ModelError
-        A file is missing, too large, not what its spec says, made for other inputs, or holds
-        what a model of this project does not need (see ``onnx_guard``).
+        A file is missing, too large, not what its spec says, of another kind, made for other
+        inputs, or holds what a model of this project does not need (see ``guard``).
     """
     limits = limits or ModelLimits()
     spec_path = path.with_suffix(".json")
@@ -99,7 +112,7 @@ def read_model(
             f"model file {path.name} was altered: its SHA-256 starts {digest[:12]}, "
             f"its spec says {str(spec.get('sha256'))[:12]}"
         )
-    _check_inputs(path.name, spec, wanted)
+    _check_kind(path.name, spec, kinds)
     try:
         check_onnx(data, limits)
     except ValueError as error:
@@ -114,36 +127,22 @@ def read_model(
     )
 
 
-def _check_inputs(name: str, spec: dict[str, Any], wanted: Mapping[str, Any] | None) -> None:
-    """Refuse a model that was made for other inputs than this version gives."""
-    kind, inputs = spec.get("kind"), spec.get("inputs")
+def _check_kind(name: str, spec: dict[str, Any], kinds: Sequence[Kind]) -> None:
+    """Refuse a model of another kind, or for other inputs than this version gives."""
+    found, inputs = spec.get("kind"), spec.get("inputs")
     inputs = inputs if isinstance(inputs, dict) else {}
-    if wanted is None:
-        if kind not in SHIPPED:
-            raise ModelError(f"model {name} has kind = {kind!r}; known are {', '.join(SHIPPED)}")
-        if kind == "single":
-            _check_sizes(name, inputs)
-        wanted = _WANTED[str(kind)]
-    for key, value in wanted.items():
+    kind = next((one for one in kinds if one.name == found), None)
+    if kind is None:
+        known = ", ".join(one.name for one in kinds)
+        raise ModelError(f"model {name} has kind = {found!r}; known here: {known}")
+    for key, value in kind.inputs.items():
         if inputs.get(key) != value:
             raise ModelError(
                 f"model {name} wants inputs.{key} = {inputs.get(key)!r}, this version gives {value}"
             )
-
-
-def _check_sizes(name: str, inputs: dict[str, Any]) -> None:
-    """Refuse sizes of the single-view predictor's picture and cells that make no sense."""
-    for key, low, high in (("pixels", 16, 1024), ("alpha", 1, 64)):
-        value = inputs.get(key)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise ModelError(
-                f"model {name} wants inputs.{key} = {value!r}; a whole number in "
-                f"{low} .. {high} is understood"
-            )
-    if inputs["pixels"] % inputs["alpha"]:
-        raise ModelError(f"model {name}: inputs.pixels is no multiple of inputs.alpha")
-    if not isinstance(inputs.get("pose"), bool):
-        raise ModelError(f"model {name} wants inputs.pose = {inputs.get('pose')!r}, not a bool")
+    unfit = kind.unfit(inputs) if kind.unfit else ""
+    if unfit:
+        raise ModelError(f"model {name} {unfit}")
 
 
 def _read(what: str, path: Path, max_bytes: int) -> bytes:

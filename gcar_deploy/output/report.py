@@ -209,10 +209,15 @@ def _facts(summary: Mapping[str, Any]) -> str:
 
 
 def _provenance(summary: Mapping[str, Any]) -> dict[str, str]:
-    model = summary["model"]
+    models = {key: summary[key] for key in ("model", "segmenter")}
+    said = {
+        key: "none" if model is None else f"{model['name']} ({model['sha256'][:12]})"
+        for key, model in models.items()
+    }
     rows = {
         "Centres": str(summary["predictor"]),
-        "Model": "none" if model is None else f"{model['name']} ({model['sha256'][:12]})",
+        "Model": said["model"],
+        "Vessel network": said["segmenter"],
         "Refinement": f"{summary['refiner']}, {summary['counts']['steps']} steps",
         "View separation": f"{summary['separation_deg']:.1f} deg",
     }

@@ -57,7 +57,8 @@ class Result:
     counts : whole numbers worth knowing (candidates, Gaussians, steps ...)
     losses : objective after every accepted refinement step
     predictor, refiner : what was used
-    model : name and SHA-256 of the model, None without one
+    model : name and SHA-256 of the centre predictor, None without one
+    segmenter : the same of the network that found vessels, None where none was asked
     notes : sentences for the user that do not lower the status
     options : RunOptions
     """
@@ -76,6 +77,7 @@ class Result:
     predictor: str
     refiner: str
     model: Mapping[str, str] | None
+    segmenter: Mapping[str, str] | None
     notes: tuple[str, ...]
     options: RunOptions
 
@@ -136,6 +138,7 @@ class Result:
             "predictor": self.predictor,
             "refiner": self.refiner,
             "model": None if self.model is None else dict(self.model),
+            "segmenter": None if self.segmenter is None else dict(self.segmenter),
             "options": dataclasses.asdict(self.options),
             "versions": versions(),
             "use": RESEARCH_USE,
@@ -148,6 +151,8 @@ class Result:
                 reasons[path] = f"no name is as probable as {LEAST_CONFIDENCE:g}"
         if self.model is None:
             reasons["/model"] = "made without a model"
+        if self.segmenter is None:
+            reasons["/segmenter"] = "no network looked for vessels in the pictures"
         out["reasons"] = reasons
         return out
 

@@ -135,10 +135,24 @@ MUTANTS = (
     ),
     Mutant(
         "models: values that are not finite pass",
-        "gcar_deploy/predict/center_predictor.py",
-        "or not np.isfinite(out).all():",
-        "or out.size < 0:",
-        ("tests/predict/test_center_predictor.py",),
+        "gcar_deploy/models/session.py",
+        "if not np.isfinite(answer).all():",
+        "if answer.size < 0:",
+        ("tests/models/test_session.py",),
+    ),
+    Mutant(
+        "models: a missing segmenter is passed over in silence",
+        "gcar_deploy/imaging/extract.py",
+        'return segmenter, [] if segmenter or options.segmenter == "net" else [MISSING]',
+        "return segmenter, []",
+        ("tests/models/test_session.py",),
+    ),
+    Mutant(
+        "models: nobody watches a running segmenter",
+        "gcar_deploy/imaging/net.py",
+        "return dataclasses.replace(self, should_stop=should_stop)",
+        "return self",
+        ("tests/models/test_session.py",),
     ),
     Mutant(
         "pictures: more data than the header promises pass",

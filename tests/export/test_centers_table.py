@@ -6,12 +6,11 @@ from click.testing import CliRunner
 
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import open_predictor
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_export.cli.main import main
 from gcar_export.methods.predictor_process import peak_mib
 from gcar_export.shipping.golden import golden_inputs
-from gcar_export.studies import centers_table
 from gcar_export.studies.centers import Truth
 from gcar_export.studies.centers_table import Cost, Row, open_models, table
 from tests.conftest import data_dir
@@ -61,13 +60,13 @@ def test_models_by_kind_or_path(monkeypatch, tmp_path):
     assert path == TINY and predictor.model.kind == "single"
     with pytest.raises(ModelError, match=r"none\.onnx"):
         open_models([str(tmp_path / "none.onnx")])
-    monkeypatch.setattr(centers_table, "shipped_model_path", lambda name: None)
+    monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: None)
     with pytest.raises(UsageError, match="no single model is installed"):
         open_models(["single"])
 
 
 def test_a_process_with_only_the_predictor_stays_small():
-    model = open_predictor(read_model(TINY)).model
+    model = open_predictor(read_predictor(TINY)).model
     peak = peak_mib(TINY, golden_inputs(model))
     assert 20 < peak < 400
 

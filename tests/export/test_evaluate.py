@@ -227,9 +227,7 @@ def test_rows_depend_on_their_own_settings_alone():
 
 
 def test_a_missing_model_is_said_before_any_work(data, tmp_path, monkeypatch):
-    from gcar_deploy import engine
-
-    monkeypatch.setattr(engine, "shipped_model_path", lambda name: None)
+    monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: None)
     methods._session.cache_clear()
     options = evaluate.EvaluateOptions(
         data=data, out=tmp_path / "out", protocol="paper", methods=("fdk", "single+paper")

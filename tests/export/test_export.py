@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.models.spec import read_model
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_export.shipping import parity as parity_module
 from gcar_export.shipping.export_onnx import load_checkpoint
 from gcar_export.shipping.parity import Parity, accept, export_checked, parity
@@ -37,7 +37,7 @@ def test_a_checkpoint_of_another_size_goes_through(exported):
     assert config in (TINY, TINY_SINGLE) and config not in (SparseConfig(), UNetConfig())
     assert found.inputs == 9 and found.worst < 1e-4 and found.decisions_equal > 0.9999
     assert found.task_torch == pytest.approx(found.task_runtime, abs=1e-3)
-    spec = read_model(model).spec
+    spec = read_predictor(model).spec
     assert spec["name"] == "m" and spec["opset"] == 18 and spec["ir_version"] == 10
     assert spec["sha256"] == hashlib.sha256(model.read_bytes()).hexdigest()
     assert {f.name for f in model.parent.iterdir()} == {
@@ -50,7 +50,7 @@ def test_card_of_the_file_is_that_of_the_spec(exported):
 
     graph = onnx.load(str(exported[1]))
     card = {entry.key: entry.value for entry in graph.metadata_props}
-    spec = read_model(exported[1]).spec
+    spec = read_predictor(exported[1]).spec
     assert card == {f"gcar.{k}": spec[k] for k in ("schema", "name", "kind", "license")}
     assert graph.ir_version == 10 and graph.opset_import[0].version == 18
     assert not any(t.data_location for t in graph.graph.initializer)
@@ -91,10 +91,10 @@ def test_what_is_refused_and_why(found, words):
 def test_task_is_measured_through_the_runtime(exported):
     checkpoint, model, _ = exported
     assert task_measure(torch_predictor(checkpoint, model), 1) == pytest.approx(
-        task_measure(read_model(model), 1), abs=1e-6
+        task_measure(read_predictor(model), 1), abs=1e-6
     )
     text = verify_model(model, 1)
-    assert "Dice at 0.5 on the hull" in text and read_model(model).sha256 in text
+    assert "Dice at 0.5 on the hull" in text and read_predictor(model).sha256 in text
 
 
 def test_int8_is_kept_or_refused_with_figures(exported, monkeypatch):
@@ -103,7 +103,7 @@ def test_int8_is_kept_or_refused_with_figures(exported, monkeypatch):
     twin = model.with_name("m-int8.onnx")
     monkeypatch.setattr("gcar_export.shipping.quantize.MOST_LOST", 0.5)
     said = quantize_checked(model, scenes=1, calibration=2)
-    assert "int8 accepted, Dice 0." in said and read_model(twin).spec["precision"].startswith(
+    assert "int8 accepted, Dice 0." in said and read_predictor(twin).spec["precision"].startswith(
         "int8"
     )
     monkeypatch.setattr("gcar_export.shipping.quantize.MOST_LOST", -1.0)

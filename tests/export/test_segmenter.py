@@ -12,8 +12,9 @@ from gcar_deploy.config import ImagingOptions  # noqa: E402
 from gcar_deploy.errors import ModelError  # noqa: E402
 from gcar_deploy.imaging.extract import extract_vessels  # noqa: E402
 from gcar_deploy.imaging.learned import support  # noqa: E402
-from gcar_deploy.imaging.net import INPUT, Segmenter, net_input  # noqa: E402
-from gcar_deploy.models.spec import read_model  # noqa: E402
+from gcar_deploy.imaging.net import KIND, net_input, open_segmenter  # noqa: E402
+from gcar_deploy.models import Kind, read_model  # noqa: E402
+from gcar_deploy.predict.kinds import read_predictor  # noqa: E402
 from gcar_export.scenes.angiogram_vessels import Vessels, catheter, random_vessels, ribbon  # noqa: E402
 from gcar_export.scenes.angiograms import (  # noqa: E402
     SIDE,
@@ -159,22 +160,21 @@ def test_training_goes_on_where_it_stopped(trained, tmp_path):
 
 @pytest.mark.slow
 def test_the_runtime_reads_and_runs_it(trained):
-    model = read_model(trained / "tiny.onnx", wanted=INPUT)
-    segmenter = Segmenter(model.data, model.name, threads=1)
+    segmenter = open_segmenter(trained / "tiny.onnx", threads=1)
     rng = np.random.default_rng(1)
     seen = segmenter.look(rng.normal(size=(3, 61, 83)).astype(np.float32))
     assert seen.probability.shape == seen.chord.shape == (61, 83)
     assert (seen.probability >= 0).all() and (seen.probability <= 1).all()
     assert (seen.chord >= 0).all() and np.isfinite(seen.chord).all()
     with pytest.raises(ModelError, match=r"wants inputs\.channels"):
-        read_model(trained / "tiny.onnx", wanted={**INPUT, "channels": 2})
+        read_model(trained / "tiny.onnx", (Kind(KIND.name, "", {**KIND.inputs, "channels": 2}),))
     with pytest.raises(ModelError, match="segmenter"):
-        read_model(trained / "tiny.onnx")
+        read_predictor(trained / "tiny.onnx")
 
 
 @pytest.mark.slow
 def test_who_is_asked(trained):
-    segmenter = Segmenter((trained / "tiny.onnx").read_bytes(), "tiny", threads=1)
+    segmenter = open_segmenter(trained / "tiny.onnx", threads=1)
     picture = angiogram(raw_picture(tube_paths()))
     with pytest.raises(ModelError, match="not loaded"):
         extract_vessels(picture, ImagingOptions(segmenter="net"))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gcar_deploy.config import ImagingOptions
-from gcar_deploy.engine import load_segmenter
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.fusion import fused
+from gcar_deploy.imaging.net import load_segmenter
 from tests.conftest import data_dir
 from tests.imaging.phantoms import angiogram, raw_picture, tube_paths
 

@@ -15,10 +15,13 @@ import pytest
 
 from gcar_deploy.config import ModelLimits
 from gcar_deploy.errors import ModelError, UsageError
+from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.models.golden import check_golden, golden_path, read_golden
-from gcar_deploy.models.spec import read_model, shipped_model_path
+from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.kinds import MULTI, PREDICTORS, read_predictor
 
+KINDS = (*PREDICTORS.values(), SEGMENTER)
 TINY = Path(__file__).parents[1] / "data" / "tiny.onnx"
 
 
@@ -44,17 +47,17 @@ def replaced(path: Path, data: bytes) -> None:
 
 @pytest.mark.req("REQ-18")
 def test_every_shipped_model_has_one_and_keeps_it():
-    shipped = shipped_model_path()
+    shipped = MULTI.path
     assert shipped is not None
     for model in sorted(shipped.parent.glob("*.onnx")):
-        found = read_model(model, wanted={})
+        found = read_model(model, KINDS)
         assert found.golden is not None, f"{model.name}: gcar-export golden {model.name}"
         session = ort.InferenceSession(found.data, providers=["CPUExecutionProvider"])
         assert check_golden(found.name, found.golden, session.run, found.limits) < 1e-4
 
 
 def test_shipped_files_are_those_of_the_manifest():
-    shipped = shipped_model_path()
+    shipped = MULTI.path
     assert shipped is not None
     lines = (shipped.parent / "SHA256SUMS").read_text().splitlines()
     listed = {name: digest for digest, name in (line.split() for line in lines)}
@@ -66,7 +69,7 @@ def test_shipped_files_are_those_of_the_manifest():
 
 @pytest.mark.req("REQ-18")
 def test_a_slightly_other_weight_is_noticed(tmp_path):
-    shipped = shipped_model_path()
+    shipped = MULTI.path
     assert shipped is not None
     copy = tmp_path / "m.onnx"
     for suffix in (".onnx", ".json", ".golden.npz"):
@@ -80,7 +83,7 @@ def test_a_slightly_other_weight_is_noticed(tmp_path):
     weight.raw_data = (values * 1.05).tobytes()
     replaced(copy, graph.SerializeToString())
     with pytest.raises(ModelError, match="golden case"):
-        CenterPredictor(read_model(copy), threads=1)
+        CenterPredictor(read_predictor(copy), threads=1)
 
 
 def test_another_models_case_is_refused(copy):
@@ -89,7 +92,7 @@ def test_another_models_case_is_refused(copy):
     arrays["model_sha256"] = np.array("0" * 64)
     np.savez(golden_path(copy), **arrays)
     with pytest.raises(ModelError, match="another model"):
-        read_model(copy)
+        read_predictor(copy)
 
 
 class _Canary:
@@ -111,7 +114,7 @@ def pickled() -> bytes:
 def test_damaged_cases_are_refused_and_nothing_is_run(copy, data):
     golden_path(copy).write_bytes(data)
     with pytest.raises(ModelError, match="damaged"):
-        read_model(copy)
+        read_predictor(copy)
 
 
 def test_a_case_that_unpacks_to_much_is_refused(copy):
@@ -122,8 +125,8 @@ def test_a_case_that_unpacks_to_much_is_refused(copy):
 
 def test_a_model_without_one_still_loads(copy):
     golden_path(copy).unlink()
-    predictor = CenterPredictor(read_model(copy), threads=1)
-    assert predictor.check_golden() is None
+    predictor = CenterPredictor(read_predictor(copy), threads=1)
+    assert predictor.session.check_golden() is None
 
 
 def test_made_again_it_loads_and_is_never_overwritten_unasked(copy):
@@ -133,7 +136,7 @@ def test_made_again_it_loads_and_is_never_overwritten_unasked(copy):
         golden.write_golden(copy)
     assert golden_path(copy).read_bytes() == before
     golden.write_golden(copy, force=True)
-    assert CenterPredictor(read_model(copy), threads=1).check_golden() == 0.0
+    assert CenterPredictor(read_predictor(copy), threads=1).session.check_golden() == 0.0
     with np.load(io.BytesIO(before)) as a, np.load(golden_path(copy)) as b:
         assert sorted(a.files) == sorted(b.files)
     assert [p.name for p in copy.parent.glob("*.old")] == []

@@ -8,9 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from gcar_deploy import engine
 from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import INPUT
+from gcar_deploy.imaging.net import INPUT, load_segmenter
 from gcar_deploy.models.golden import golden_path
 
 onnx = pytest.importorskip("onnx", reason="needs the export extra")
@@ -19,7 +18,7 @@ from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 @pytest.fixture
 def model(tmp_path, monkeypatch):
-    """A network of one convolution, where the engine looks for the shipped one."""
+    """A network of one convolution, where the runtime looks for the shipped one."""
     weight = numpy_helper.from_array(np.full((1, INPUT["channels"], 1, 1), 0.5, np.float32), "w")
     nodes = [
         helper.make_node("Conv", ["channels", "w"], ["h"]),
@@ -31,7 +30,7 @@ def model(tmp_path, monkeypatch):
     graph = helper.make_graph(nodes, "g", [x], [y], [weight])
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
     path = tmp_path / "segmenter.onnx"
-    monkeypatch.setattr(engine, "shipped_model_path", lambda name: path)
+    monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: path)
     write(path, made)
     return path, made
 
@@ -48,7 +47,7 @@ def test_the_case_is_made_and_checked_at_load(model):
     golden = pytest.importorskip("gcar_export.shipping.golden", reason="needs the export extra")
     path, made = model
     assert golden.write_golden(path).exists()
-    assert engine.load_segmenter("net") is not None
+    assert load_segmenter("net") is not None
     made.graph.initializer[0].CopyFrom(
         numpy_helper.from_array(np.full((1, INPUT["channels"], 1, 1), 0.6, np.float32), "w")
     )
@@ -59,4 +58,4 @@ def test_the_case_is_made_and_checked_at_load(model):
     arrays["model_sha256"] = np.array(digest)
     np.savez(golden_path(path), **arrays)
     with pytest.raises(ModelError, match="golden case"):
-        engine.load_segmenter("net")
+        load_segmenter("net")

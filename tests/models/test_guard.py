@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gcar_deploy.config import ModelLimits
 from gcar_deploy.models.constants import Constant, Node, check_constants
 from gcar_deploy.models.guard import OPERATORS, check_onnx
-from gcar_deploy.models.spec import shipped_model_path
+from gcar_deploy.predict.kinds import MULTI
 
 onnx = pytest.importorskip("onnx", reason="needs the export extra")
 from google.protobuf.message import DecodeError  # noqa: E402
@@ -267,9 +267,8 @@ def test_good_models_pass():
     filled(1.0, typed=True)(typed)
     check_onnx(typed.SerializeToString(), ModelLimits())
     check_onnx(TINY.read_bytes(), ModelLimits())
-    shipped = shipped_model_path()
-    assert shipped is not None
-    check_onnx(shipped.read_bytes(), ModelLimits())
+    assert MULTI.path is not None
+    check_onnx(MULTI.path.read_bytes(), ModelLimits())
 
 
 @pytest.mark.parametrize("name", ATTACKS)

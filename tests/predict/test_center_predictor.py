@@ -10,11 +10,11 @@ import pytest
 
 from gcar_deploy.config import CandidateOptions, DecideOptions
 from gcar_deploy.errors import ModelError, NumericalError
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor
 from gcar_deploy.predict.decision import decide
 from gcar_deploy.predict.encoding import encode
 from gcar_deploy.predict.hull import visual_hull
+from gcar_deploy.predict.kinds import read_predictor
 
 pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
 from tests.predict.test_hull import GRID, scene
@@ -30,7 +30,7 @@ def inputs(angles=((-30, -20), (45, 25))):
 
 def test_one_answer_per_candidate():
     hull, encoded = inputs()
-    centers = CenterPredictor(read_model(TINY)).predict(hull, encoded)
+    centers = CenterPredictor(read_predictor(TINY)).predict(hull, encoded)
     assert len(centers) == len(hull)
     assert ((centers.confidence >= 0) & (centers.confidence <= 1)).all()
     assert (centers.radius_mm > 0).all()
@@ -39,7 +39,7 @@ def test_one_answer_per_candidate():
 
 @pytest.mark.req("REQ-34")
 def test_any_number_of_views_in_any_order():
-    predictor = CenterPredictor(read_model(TINY))
+    predictor = CenterPredictor(read_predictor(TINY))
     angles = ((-30, -20), (45, 25), (0, 30), (80, 0))
     for n in (2, 3, 4):
         a = predictor.predict(*inputs(angles[:n]))
@@ -52,7 +52,7 @@ def test_any_number_of_views_in_any_order():
 def test_same_input_same_bytes(threads):
     """Sums by scatter would race between threads and fail this."""
     hull, encoded = inputs()
-    predictor = CenterPredictor(read_model(TINY), threads=threads)
+    predictor = CenterPredictor(read_predictor(TINY), threads=threads)
     first = predictor.predict(hull, encoded).confidence.tobytes()
     for _ in range(10):
         assert predictor.predict(hull, encoded).confidence.tobytes() == first
@@ -71,7 +71,7 @@ def test_altered_model_is_refused(copy):
     data[len(data) // 2] ^= 1
     copy.write_bytes(bytes(data))
     with pytest.raises(ModelError, match="was altered"):
-        read_model(copy)
+        read_predictor(copy)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_altered_model_is_refused(copy):
 def test_wrong_files_say_what_is_wrong(copy, change, message):
     change(copy)
     with pytest.raises(ModelError, match=message):
-        read_model(copy)
+        read_predictor(copy)
 
 
 def edit(path, key, value):
@@ -108,7 +108,7 @@ def test_a_model_that_is_no_model(copy):
     copy.write_bytes(b"not a graph")
     edit(copy, "sha256", hashlib.sha256(b"not a graph").hexdigest())
     with pytest.raises(ModelError, match="no ONNX model"):
-        CenterPredictor(read_model(copy))
+        CenterPredictor(read_predictor(copy))
 
 
 class _Broken:
@@ -120,7 +120,7 @@ class _Broken:
 
 @pytest.mark.req("REQ-20")
 def test_values_that_are_not_finite_are_an_error():
-    untested = dataclasses.replace(read_model(TINY), golden=None)
+    untested = dataclasses.replace(read_predictor(TINY), golden=None)
     with pytest.raises(NumericalError, match="not finite"):
         CenterPredictor(untested, session=_Broken()).predict(*inputs())
 
@@ -137,7 +137,7 @@ def test_decision_explains_rays_and_prefers_the_likelier(calibrated):
     truth, _, _ = occupancy(hull.points_mm, 1.0, p[:-1], p[1:], np.full(len(p) - 1, 1.6))
     rng = np.random.default_rng(0)
     hedged = np.clip(0.06 + 0.45 * truth + 0.12 * rng.normal(size=len(truth)), 0.02, 0.98)
-    centers = CenterPredictor(read_model(TINY)).predict(hull, encoded)
+    centers = CenterPredictor(read_predictor(TINY)).predict(hull, encoded)
     decided = decide(
         replace(centers, confidence=hedged), encoded, 0.0 if calibrated else 0.25, DecideOptions()
     )

@@ -11,12 +11,11 @@ import pytest
 from gcar_deploy import Engine, RunOptions
 from gcar_deploy.config import CandidateOptions, PredictOptions, SingleViewOptions
 from gcar_deploy.errors import ModelError, NumericalError
-from gcar_deploy.models import spec as model_spec
-from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_map import decode, encode_depth, net_picture
 from gcar_deploy.predict.center_predictor import SingleViewPredictor, open_predictor
 from gcar_deploy.predict.encoding import encode
 from gcar_deploy.predict.hull import visual_hull
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.predict.single_view import agreement, merge_views
 from gcar_deploy.selftest import tiny_case
 
@@ -97,7 +96,7 @@ def test_a_view_that_says_nothing_changes_nothing(hull):
 
 
 def test_one_set_of_centres_per_view_of_any_size():
-    predictor = open_predictor(read_model(TINY))
+    predictor = open_predictor(read_predictor(TINY))
     assert isinstance(predictor, SingleViewPredictor)
     views = scene(((-30, -20), (45, 25), (0, 30)))
     found = predictor.predict(views)
@@ -126,7 +125,7 @@ def test_a_model_of_the_other_kind_is_refused():
 
 @pytest.mark.parametrize("wanted", ["auto", "multi", "single"])
 def test_without_a_model_the_hull_is_thinned_and_the_result_says_so(wanted, monkeypatch, tmp_path):
-    monkeypatch.setattr(model_spec.resources, "files", lambda _: tmp_path)
+    monkeypatch.setattr("gcar_deploy.models.spec.resources.files", lambda _: tmp_path)
     angiograms, grid, _ = tiny_case()
     options = RunOptions(predict=PredictOptions(predictor=wanted))
     result = Engine(options=options).reconstruct(angiograms, grid)
@@ -161,7 +160,7 @@ def test_a_spec_that_does_not_fit_says_where(copy, key, value, message):
     (spec if key == "kind" else spec["inputs"])[key] = value
     file.write_text(json.dumps(spec))
     with pytest.raises(ModelError, match=message):
-        read_model(copy)
+        read_predictor(copy)
 
 
 def test_another_golden_answer_is_refused(copy):
@@ -173,7 +172,7 @@ def test_another_golden_answer_is_refused(copy):
     arrays["output/centers"] = arrays["output/centers"] + 0.01
     np.savez(found, **arrays)
     with pytest.raises(ModelError, match="golden case"):
-        open_predictor(read_model(copy))
+        open_predictor(read_predictor(copy))
 
 
 class _Broken:
@@ -184,6 +183,6 @@ class _Broken:
 
 
 def test_values_that_are_not_finite_are_an_error():
-    untested = dataclasses.replace(read_model(TINY), golden=None)
+    untested = dataclasses.replace(read_predictor(TINY), golden=None)
     with pytest.raises(NumericalError, match="not finite"):
         open_predictor(untested, session=_Broken()).predict(scene(((-30, -20), (45, 25))))

@@ -11,10 +11,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
+from gcar_deploy.config import ModelLimits
 from gcar_deploy.errors import ModelError
 from gcar_deploy.models.golden import Golden, read_golden
-from gcar_deploy.models.spec import ModelLimits, read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.kinds import read_predictor
 from tests.battery.damage import EDGES, damaged
 from tests.battery.kinds.common import generator, outcome
 from tests.battery.pool import Case, FoundError
@@ -58,8 +59,8 @@ def _write(path: Path, data: bytes, spec: dict, golden: Golden, rng: random.Rand
 
 
 def _run(path: Path, golden: Golden) -> str:
-    predictor = CenterPredictor(read_model(path), threads=1)
-    answer = next(iter(predictor.answers(golden.inputs).values()))
+    predictor = CenterPredictor(read_predictor(path), threads=1)
+    answer = next(iter(predictor.session.answers(golden.inputs).values()))
     expected = golden.outputs["centers"]
     same = answer.shape == expected.shape and bool(np.allclose(answer, expected, 1e-3, 1e-4))
     if predictor.model.golden is not None and not same:

@@ -1,0 +1,167 @@
+"""A model that runs: the one place that imports ONNX Runtime."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+
+from gcar_deploy.errors import CancelledError, ModelError, NumericalError
+from gcar_deploy.models.golden import check_golden
+from gcar_deploy.models.spec import ModelFile
+from gcar_deploy.types import Array
+
+#: how often a running inference is asked whether it should end, seconds
+WATCH_S = 0.02
+
+
+class Session:
+    """A warm session of one model; safe to share between threads.
+
+    Parameters
+    ----------
+    model : ModelFile, as ``read_model`` returns it; its golden case, if any, is run at once
+    inputs : names of the graph's inputs that the caller will give
+    threads : int, within one inference; spinning is off, so idle threads cost nothing
+    arena : bool, keep the memory of an inference for the next one: a quarter faster
+    runtime : an existing ``onnxruntime.InferenceSession`` of the same model, optional
+
+    Raises
+    ------
+    ModelError
+        The model does not load, wants other inputs, or fails its golden case.
+    """
+
+    def __init__(
+        self,
+        model: ModelFile,
+        inputs: Sequence[str],
+        *,
+        threads: int = 2,
+        arena: bool = True,
+        runtime: Any = None,
+    ) -> None:
+        self.model = model
+        if runtime is None:
+            runtime = _open(model, threads, arena)
+            found = [node.name for node in runtime.get_inputs()]
+            if sorted(found) != sorted(inputs) or not runtime.get_outputs():
+                raise ModelError(f"model {model.name} has other inputs than this version gives")
+        self._runtime = runtime
+        self.check_golden()
+
+    def check_golden(self) -> float | None:
+        """Run the model's golden case again; return the largest difference, None without one.
+
+        Raises
+        ------
+        ModelError
+            It answers differently from the day it was made.
+        """
+        if self.model.golden is None:
+            return None
+        return check_golden(self.model.name, self.model.golden, self._run, self.model.limits)
+
+    def answers(self, feed: Mapping[str, Array]) -> dict[str, Array]:
+        """Run the graph on named inputs; return its outputs by name, as they are."""
+        names = [node.name for node in self._runtime.get_outputs()]
+        return dict(zip(names, self._run(names, feed), strict=True))
+
+    def run(
+        self,
+        feed: Mapping[str, Array],
+        shapes: Sequence[tuple[int, ...]],
+        *,
+        outputs: Sequence[str] | None = None,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> list[Array]:
+        """Run the graph and hold its answers to what they must be.
+
+        Parameters
+        ----------
+        feed : inputs by name
+        shapes : of the answers, in their order
+        outputs : names of the answers; None for the graph's first ones
+        should_stop : asked every ``WATCH_S`` from another thread; True ends a running inference
+
+        Returns
+        -------
+        One array per shape; every value is finite.
+
+        Raises
+        ------
+        ModelError, NumericalError
+            The model cannot run on these inputs; it returned another shape, or values that are
+            not finite.
+        CancelledError
+            ``should_stop`` said so.
+        """
+        with _watched(should_stop) as options:
+            found = self._run(outputs, feed, options)[: len(shapes)]
+        for answer, shape in zip(found, shapes, strict=True):
+            if answer.shape != shape:
+                raise NumericalError(
+                    f"model {self.model.name} returned {answer.shape} values, not {shape}"
+                )
+            if not np.isfinite(answer).all():
+                raise NumericalError(f"model {self.model.name} returned values that are not finite")
+        return found
+
+    def _run(
+        self, outputs: Sequence[str] | None, feed: Mapping[str, Array], options: Any = None
+    ) -> list[Array]:
+        try:
+            found: list[Array] = self._runtime.run(outputs, dict(feed), options)
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+            if getattr(options, "terminate", False):
+                raise CancelledError("cancelled while the model ran") from None
+            raise ModelError(f"model {self.model.name} fails: {_first_line(error)}") from None
+        return found
+
+
+def _open(model: ModelFile, threads: int, arena: bool) -> ort.InferenceSession:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.enable_cpu_mem_arena = arena
+    # Memory patterns, planned anew for each number of points, add two thirds to the peak of the
+    # centre predictor and nothing to its speed.
+    options.enable_mem_pattern = False
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return ort.InferenceSession(model.data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+        raise ModelError(f"model {model.name} does not load: {_first_line(error)}") from None
+
+
+@contextlib.contextmanager
+def _watched(should_stop: Callable[[], bool] | None) -> Iterator[Any]:
+    """RunOptions whose run ends soon after ``should_stop`` says so; None without a question."""
+    if should_stop is None:
+        yield None
+        return
+    options, over = ort.RunOptions(), threading.Event()
+
+    def watch() -> None:
+        # Inference holds the calling thread for its whole length: only another one can ask.
+        while not over.wait(WATCH_S):
+            if should_stop():
+                options.terminate = True
+                return
+
+    watcher = threading.Thread(target=watch, name="gcar-watch", daemon=True)
+    watcher.start()
+    try:
+        yield options
+    finally:
+        over.set()
+        watcher.join()
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

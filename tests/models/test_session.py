@@ -1,0 +1,155 @@
+"""One session for every network: named in the result, missed aloud, watched, and held to shapes."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcar_deploy import Engine
+from gcar_deploy.config import ImagingOptions, PredictOptions, RunOptions
+from gcar_deploy.errors import CancelledError, ModelError, NumericalError
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.net import KIND as SEGMENTER
+from gcar_deploy.imaging.net import MISSING
+from gcar_deploy.models import Session, shipped_model_path
+from gcar_deploy.models import session as session_module
+from gcar_deploy.predict.encoding import input_names
+from gcar_deploy.predict.kinds import read_predictor
+from gcar_deploy.selftest import tiny_case
+
+TINY = Path(__file__).parents[1] / "data" / "tiny.onnx"
+HULL = RunOptions(predict=PredictOptions(predictor="none"))
+
+
+def raw_pair():
+    """The self-test's tree as raw pictures of 8 bits: Beer's law and a little noise."""
+    angiograms, grid, _ = tiny_case()
+    pair = []
+    for seed, one in enumerate(angiograms):
+        path = one.pixels * one.intensity.mm_per_count
+        noise = np.random.default_rng(seed).normal(0, 1, path.shape)
+        grey = np.clip(160 * np.exp(-0.15 * path) + noise, 0, 255).round().astype(np.float32)
+        pair.append(dataclasses.replace(one, pixels=grey, intensity=Intensity(kind="raw")))
+    return pair, grid
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return raw_pair()
+
+
+def test_a_raw_pair_names_the_network_that_found_its_vessels(raw):
+    summary = Engine(options=HULL, threads=1).reconstruct(*raw).summary()
+    assert summary["segmenter"]["name"] == "segmenter"
+    manifest = (shipped_model_path("segmenter").parent / "SHA256SUMS").read_text()
+    assert f"{summary['segmenter']['sha256']}  segmenter.onnx" in manifest.splitlines()
+
+
+@pytest.mark.parametrize("case", ["path lengths", "masks", "classic"])
+def test_where_no_network_was_asked_none_is_named(case, raw):
+    angiograms, grid = tiny_case()[:2] if case == "path lengths" else raw
+    options = HULL
+    if case == "masks":
+        drawn = [a.pixels * a.intensity.mm_per_count > 0.3 for a in tiny_case()[0]]
+        angiograms = [dataclasses.replace(a, mask=m) for a, m in zip(raw[0], drawn, strict=True)]
+    if case == "classic":
+        options = dataclasses.replace(HULL, imaging=ImagingOptions(segmenter="classic"))
+    result = Engine(options=options, threads=1).reconstruct(angiograms, grid)
+    assert result.summary()["segmenter"] is None and result.summary()["reasons"]["/segmenter"]
+    assert MISSING not in result.quality.findings
+
+
+def test_a_missing_network_is_never_silent(raw, monkeypatch):
+    there = shipped_model_path
+    monkeypatch.setattr(
+        "gcar_deploy.models.spec.shipped_model_path",
+        lambda name: None if name == SEGMENTER.shipped else there(name),
+    )
+    result = Engine(threads=1).reconstruct(*raw)
+    assert result.segmenter is None and result.status == "degraded"
+    assert MISSING in result.quality.findings
+    # Nobody was to ask it here.
+    calibrated = Engine(threads=1).reconstruct(*tiny_case()[:2])
+    assert calibrated.status == "ok" and MISSING not in calibrated.quality.findings
+
+
+def slow(monkeypatch, seconds):
+    """Let every inference of the segmenter take at least so long, as a large picture would."""
+    run = Session._run
+
+    def late(self, outputs, feed, options=None):
+        end = time.monotonic() + seconds
+        while self.model.kind == SEGMENTER.name and time.monotonic() < end:
+            if getattr(options, "terminate", False):
+                raise CancelledError("cancelled while the model ran")
+            time.sleep(1e-3)
+        return run(self, outputs, feed, options)
+
+    monkeypatch.setattr(Session, "_run", late)
+
+
+def test_a_running_segmenter_is_cancelled(raw, monkeypatch):
+    """Asked from another thread, since inference holds the calling one."""
+    monkeypatch.setattr(session_module, "WATCH_S", 1e-3)
+    engine = Engine(options=HULL, threads=1)
+    engine.reconstruct(*raw)  # the network is loaded
+    askers, stage = set(), [""]
+
+    def cancel():
+        if stage[0] == "vessels":
+            askers.add(threading.current_thread().name)
+        return "gcar-watch" in askers
+
+    with pytest.raises(CancelledError, match="by the caller"):
+        engine.reconstruct(*raw, cancel=cancel, on_progress=lambda s, _: stage.__setitem__(0, s))
+    assert stage[0] == "vessels"
+    assert not any(t.name == "gcar-watch" for t in threading.enumerate())
+
+
+def test_the_deadline_reaches_a_running_segmenter(raw, monkeypatch):
+    engine = Engine(options=HULL, threads=1)
+    engine.reconstruct(*raw)
+    slow(monkeypatch, 20.0)
+    start = time.monotonic()
+    with pytest.raises(CancelledError, match=r"deadline of 0\.5 s"):
+        engine.reconstruct(*raw, deadline_s=0.5)
+    assert time.monotonic() - start < 5.0
+
+
+class _Runtime:
+    """Answers with what it was given."""
+
+    def __init__(self, *answers):
+        self.answers = list(answers)
+
+    def run(self, outputs, feed, options):
+        return self.answers
+
+
+def session(*answers):
+    untested = dataclasses.replace(read_predictor(TINY), golden=None)
+    return Session(untested, input_names(), runtime=_Runtime(*answers))
+
+
+def test_answers_are_held_to_shape_and_to_finite_numbers():
+    good, more = np.zeros((2, 5)), np.full(3, np.nan)
+    assert session(good, more).run({}, [(2, 5)]) == [good]  # only the first is asked for
+    with pytest.raises(NumericalError, match=r"returned \(2, 5\) values, not \(5, 2\)"):
+        session(good).run({}, [(5, 2)])
+    for wrong in (np.nan, np.inf):
+        bad = good.copy()
+        bad[1, 4] = wrong
+        with pytest.raises(NumericalError, match="tiny returned values that are not finite"):
+            session(bad).run({}, [(2, 5)])
+
+
+def test_inputs_are_the_graphs_own():
+    with pytest.raises(ModelError, match="has other inputs than this version gives"):
+        Session(read_predictor(TINY), ["picture"])
+    with pytest.raises(ModelError, match="model tiny fails: "):
+        Session(read_predictor(TINY), input_names()).run({}, [(1, 5)])
