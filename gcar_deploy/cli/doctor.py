@@ -7,11 +7,14 @@ import os
 import platform
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from gcar_deploy.cli.common import set_up_logging
+
+if TYPE_CHECKING:
+    from gcar_deploy.models import Kind
 
 #: instruction sets that the numerical libraries gain from
 _FLAGS = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512_vnni", "amx_int8", "asimd", "sve")
@@ -23,17 +26,20 @@ _SELF_TEST_MM = 1.0
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
 def doctor(as_json: bool, verbose: bool) -> None:
-    """Check this installation: versions, processor, threads, model, a small reconstruction.
+    """Check this installation: versions, processor, threads, models, a small reconstruction.
 
     \b
     Example:
       gcar doctor
     """  # noqa: D301 - click wants a real backspace
-    from gcar_deploy.errors import GcarError
+    from gcar_deploy.errors import GcarError, ModelError
 
     set_up_logging(verbose, quiet=False)
     report = examine()
     click.echo(json.dumps(report, allow_nan=False) if as_json else "\n".join(lines(report)))
+    unsound = [f"{one['name']}: {one['sentence']}" for one in report["models"] if not one["sound"]]
+    if unsound:
+        raise ModelError("; ".join(unsound))
     if not report["self_test"]["passed"]:
         raise GcarError(f"self-test failed: {report['self_test']['sentence']}")
 
@@ -54,7 +60,7 @@ def examine() -> dict[str, Any]:
             "opencv": cv2.getNumThreads(),
             "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS"),
         },
-        "model": model(),
+        "models": models(),
         "torch_imported": "torch" in sys.modules,
         "network": "not used by any verb",
         "self_test": self_test(),
@@ -75,23 +81,36 @@ def processor() -> dict[str, Any]:
     return {"name": name, "flags": [flag for flag in _FLAGS if flag in flags]}
 
 
-def model() -> dict[str, Any]:
-    """Name and hash of the shipped model, or why there is none."""
-    from gcar_deploy.errors import ModelError
-    from gcar_deploy.models.spec import read_model, shipped_model_path
-    from gcar_deploy.predict.center_predictor import open_predictor
+def models() -> list[dict[str, Any]]:
+    """Name, hash and golden case of every model that comes along, or why it is unfit."""
+    from gcar_deploy.imaging.net import KIND as SEGMENTER
+    from gcar_deploy.predict.kinds import PREDICTORS
 
-    path = shipped_model_path()
-    if path is None:
-        return {"name": None, "sentence": "no model is installed; the visual hull is thinned"}
+    return [_model(kind) for kind in (*PREDICTORS.values(), SEGMENTER)]
+
+
+def _model(kind: Kind) -> dict[str, Any]:
+    from gcar_deploy.errors import ModelError
+    from gcar_deploy.imaging.net import open_segmenter
+    from gcar_deploy.predict.center_predictor import open_predictor
+    from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
+
+    out = {"name": kind.shipped, "sha256": None, "sound": False, "golden": None}
+    if kind.path is None:
+        return {**out, "sentence": "not installed"}
     try:
-        found = read_model(path)
-        worst = open_predictor(found, threads=1).check_golden()
+        if kind.name in PREDICTORS:
+            session = open_predictor(read_predictor(kind.path), threads=1).session
+        else:
+            session = open_segmenter(kind.path, threads=1).session
+        worst = session.check_golden()
     except ModelError as error:
-        return {"name": path.stem, "sentence": str(error)}
+        return {**out, "sentence": str(error)}
     golden = "no golden case" if worst is None else f"golden case within {worst:.0e}"
-    sentence = f"matches its spec; {golden}"
-    return {"name": found.name, "sha256": found.sha256, "sentence": sentence, "golden": worst}
+    return {
+        **out, "sha256": session.model.sha256, "sound": True, "golden": worst,
+        "sentence": f"matches its spec; {golden}",
+    }  # fmt: skip
 
 
 def self_test() -> dict[str, Any]:
@@ -127,7 +146,7 @@ def lines(report: dict[str, Any]) -> list[str]:
     out.append(f"{'processor':32s} {cpu['name']} ({', '.join(cpu['flags']) or 'flags unknown'})")
     out.append(f"{'cores, usable, OpenCV threads':32s} "
                f"{threads['cores']}, {threads['usable']}, {threads['opencv']}")  # fmt: skip
-    out.append(f"{'model':32s} {report['model']['name']}: {report['model']['sentence']}")
+    out += [f"{'model ' + one['name']:32s} {one['sentence']}" for one in report["models"]]
     out.append(f"{'network':32s} {report['network']}")
     seconds = "" if test["seconds"] is None else f" ({test['seconds']:.2f} s)"
     out.append(f"{'self-test':32s} {'passed' if test['passed'] else 'FAILED'}: "

@@ -11,9 +11,10 @@ from importlib import resources
 
 import pytest
 
+from gcar_deploy.cli import doctor as doctor_verb
 from gcar_deploy.cli import main as entry
 from gcar_deploy.cli.main import VERBS
-from gcar_deploy.models.spec import SHIPPED, shipped_model_path
+from gcar_deploy.predict.kinds import MULTI, PREDICTORS
 from tests.cli.conftest import gcar
 
 
@@ -133,6 +134,35 @@ def test_doctor_passes_its_self_test():
     report = json.loads(done.out)
     assert report["self_test"]["passed"] and report["torch_imported"] == before
     assert report["versions"]["numpy"]
+    assert {one["name"] for one in report["models"]} == {"gcp-multi", "gcp-single", "segmenter"}
+    assert all(one["sound"] and one["golden"] < 1e-3 for one in report["models"])
+
+
+@pytest.mark.parametrize("name", ["gcp-multi", "gcp-single", "segmenter"])
+@pytest.mark.parametrize("fault", ["missing", "altered"])
+def test_doctor_checks_every_shipped_model(name, fault, tmp_path, monkeypatch):
+    for file in MULTI.path.parent.iterdir():
+        if file.suffix in (".onnx", ".json", ".npz"):
+            (tmp_path / file.name).symlink_to(file)
+    model = tmp_path / f"{name}.onnx"
+    data = bytearray(model.read_bytes())
+    data[len(data) // 2] ^= 1
+    model.unlink()
+    if fault == "altered":
+        model.write_bytes(data)
+    monkeypatch.setattr("gcar_deploy.models.spec.resources.files", lambda _: tmp_path)
+    monkeypatch.setattr(
+        doctor_verb,
+        "self_test",
+        lambda: {"passed": True, "sentence": "", "seconds": None, "distance_mm": None},
+    )
+    done = gcar("doctor", "--json")
+    assert done.code == 5 and name in done.err
+    unsound = {
+        one["name"]: one["sentence"] for one in json.loads(done.out)["models"] if not one["sound"]
+    }
+    words = "was altered" if fault == "altered" else "not installed"
+    assert list(unsound) == [name] and words in unsound[name]
 
 
 def test_demo_ends_with_a_picture_and_the_time(tmp_path):
@@ -207,7 +237,7 @@ def test_run_with_the_single_view_predictor_says_so(good_case, tmp_path):
 
 @pytest.mark.parametrize("kind", ["multi", "single"])
 def test_info_prints_the_card_of_a_model(kind, tmp_path):
-    path = shipped_model_path(SHIPPED[kind])
+    path = PREDICTORS[kind].path
     done = gcar("info", path)
     assert done.code == 0 and f"gcp-{kind}: {kind}-view Gaussian centre predictor" in done.out
     spec = json.loads(path.with_suffix(".json").read_text())
