@@ -21,6 +21,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, extract_vessels
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.resample import sampled_path
+from gcar_deploy.measure.inlet import from_inlets
 from gcar_deploy.output.result import Result
 from gcar_deploy.pose.agreement import (
     agreeing,
@@ -158,6 +159,7 @@ def reconstruct(
         findings += alternatives.findings(open_, elsewhere)
         with with_hint(hint):
             judged = quality.assess(tree, views, lumen, findings, worst, options.quality)
+        tree = from_inlets(tree)
     return Result(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=tuple(views), poses=poses,

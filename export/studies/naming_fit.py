@@ -20,7 +20,7 @@ from gcar_deploy.measure.naming import (
     LEFT_FIGURES,
     RIGHT_FIGURES,
     Template,
-    name_branches,
+    read_anatomy,
     readings,
 )
 from gcar_export.studies.naming_cases import (
@@ -195,7 +195,7 @@ def tally(judged: Iterable[tuple[NamedTree, dict[str, Template] | None]]) -> dic
     """
     out: dict[str, list[float]] = {name: [0.0] * 6 for name in (*NAMES, "none")}
     for case, usual in judged:
-        found = name_branches(case.tree, usual=usual)
+        found = read_anatomy(case.tree, usual=usual).names
         for branch, name, true in zip(case.tree.branches, found, case.names, strict=True):
             right = name is not None and name.name == true
             wrong = name is not None and not right

@@ -120,7 +120,7 @@ def reference_curve(arc_mm: Scalars, diameter_mm: Scalars) -> Scalars:
     """(m,) healthy diameter: a line through the wider parts of a vessel.
 
     Asymmetric least squares (expectile regression) with weight ``REFERENCE_EXPECTILE`` above the
-    line. It may rise or fall: branches run both ways.
+    line. It may rise as well as fall: some vessels widen downstream.
     """
     design = np.stack([np.ones(len(arc_mm)), arc_mm - arc_mm.mean()], axis=1)
     weight = np.ones(len(arc_mm))

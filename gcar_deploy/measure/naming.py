@@ -86,11 +86,26 @@ class BranchName:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reading:
-    """One way to read a component: side, name of each named branch, figures."""
+    """One way to read a component: side, name of each named branch, figures, node of the ostium."""
 
     side: str
     names: dict[int, str]
     figures: Scalars
+    inlet: int
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Anatomy:
+    """What anatomy says of a tree.
+
+    Attributes
+    ----------
+    names : per branch its name, or None
+    inlets : nodes at which a left main or right coronary artery begins, as sure as a name
+    """
+
+    names: tuple[BranchName | None, ...]
+    inlets: tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,9 +124,9 @@ class Template:
         return out
 
 
-def name_branches(
+def read_anatomy(
     tree: Tree, least: float = LEAST_CONFIDENCE, usual: Mapping[str, Template] | None = None
-) -> tuple[BranchName | None, ...]:
+) -> Anatomy:
     """Name what can be named of a tree.
 
     Parameters
@@ -119,23 +134,27 @@ def name_branches(
     tree : Tree, mm LPS; its place does not matter, its directions do
     least : probability from which on a branch is named
     usual : what is usual on each side; None takes that of the package
-
-    Returns
-    -------
-    per branch its name, or None
     """
-    out: list[BranchName | None] = [None] * len(tree.branches)
+    names: list[BranchName | None] = [None] * len(tree.branches)
     if not tree.branches:
-        return ()
+        return Anatomy(names=(), inlets=())
+    inlets = []
     component = tree.components()
     of_branch = np.array([component[branch.start] for branch in tree.branches])
     for k in range(int(component.max()) + 1):
-        own = np.flatnonzero(of_branch == k)
-        for number, chances in _chances(tree, own, usual or templates()).items():
+        found = readings(tree, np.flatnonzero(of_branch == k))
+        shares = probabilities(found, usual or templates())
+        for number, chances in _chances(found, shares).items():
             name = max(chances, key=lambda n: chances[n])
             if chances[name] >= least:
-                out[number] = BranchName(name=name, confidence=chances[name])
-    return _contradictions_dropped(tree, out)
+                names[number] = BranchName(name=name, confidence=chances[name])
+        ostia: dict[int, float] = {}
+        for reading, share in zip(found, shares, strict=True):
+            ostia[reading.inlet] = ostia.get(reading.inlet, 0.0) + float(share)
+        inlets += [node for node, share in ostia.items() if share >= least]
+    if _contradicting(tree, names):
+        return Anatomy(names=(None,) * len(names), inlets=())
+    return Anatomy(names=tuple(names), inlets=tuple(inlets))
 
 
 def readings(tree: Tree, own: Array) -> list[Reading]:
@@ -190,11 +209,10 @@ def templates() -> dict[str, Template]:
     return out
 
 
-def _chances(tree: Tree, own: Array, usual: Mapping[str, Template]) -> dict[int, dict[str, float]]:
+def _chances(found: list[Reading], shares: Scalars) -> dict[int, dict[str, float]]:
     """Branch to the probability of each name that some reading gives it."""
-    found = readings(tree, own)
     out: dict[int, dict[str, float]] = {}
-    for reading, share in zip(found, probabilities(found, usual), strict=True):
+    for reading, share in zip(found, shares, strict=True):
         for branch, name in reading.names.items():
             chances = out.setdefault(branch, {})
             chances[name] = chances.get(name, 0.0) + float(share)
@@ -239,7 +257,7 @@ def _left(a: Route, c: Route, ways: list[Route], calibre: float, whole: float) -
         (to_apex.max() - own_a) / 20.0, (to_back.max() - c.points_mm[-1, 1]) / 20.0,
         (trunk + lad + lcx) / whole, (c.points_mm[-1, 2] - a.points_mm[-1, 2]) / 20.0,
     ]  # fmt: skip
-    return Reading("left", names, np.array(figures))
+    return Reading("left", names, np.array(figures), a.nodes[0])
 
 
 def _shared(a: Route, b: Route) -> int:
@@ -263,13 +281,12 @@ def _right(way: Route, ways: list[Route], calibre: float, whole: float) -> Readi
         np.log(way.mean_radius(0.5 * length, length) / way.mean_radius(0.0, 0.5 * length)),
         length / whole, max(off) / length,
     ]  # fmt: skip
-    return Reading("right", dict.fromkeys(way.branches, "RCA"), np.array(figures))
+    names = dict.fromkeys(way.branches, "RCA")
+    return Reading("right", names, np.array(figures), way.nodes[0])
 
 
-def _contradictions_dropped(
-    tree: Tree, names: list[BranchName | None]
-) -> tuple[BranchName | None, ...]:
-    """No names at all where a left tree would stand to the right of a right one."""
+def _contradicting(tree: Tree, names: list[BranchName | None]) -> bool:
+    """Whether a left tree would stand to the right of a right one."""
     middle = {}
     for side, of_side in (("left", ("LAD", "LCx")), ("right", ("RCA",))):
         points = [
@@ -279,9 +296,7 @@ def _contradictions_dropped(
         ]
         if points:
             middle[side] = float(np.concatenate(points).mean())
-    if len(middle) == 2 and middle["left"] <= middle["right"]:
-        return (None,) * len(names)
-    return tuple(names)
+    return len(middle) == 2 and middle["left"] <= middle["right"]
 
 
 def _unit(way: Array) -> Array:

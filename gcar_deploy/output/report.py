@@ -156,7 +156,7 @@ def _angles(summary: Mapping[str, Any]) -> str:
     rows = {}
     for k, node in enumerate(summary["tree"]["bifurcations"], start=1):
         rows[f"Bifurcation {k}"] = "; ".join(
-            f"{angle['branches'][0] + 1} and {angle['branches'][1] + 1}: {angle['angle_deg']:.0f}°"
+            f"{angle['branches'][0]} and {angle['branches'][1]}: {angle['angle_deg']:.0f}°"
             for angle in node["angles"]
         )
     return _rows(rows) or "<tr><td>none</td></tr>"

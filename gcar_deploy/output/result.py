@@ -21,7 +21,7 @@ from gcar_deploy.geometry.observability import EXACT_DISAGREEMENT, silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.measure.further_view import best_further_view
 from gcar_deploy.measure.lumen import BranchLumen, bifurcation_angles, branch_lumens
-from gcar_deploy.measure.naming import LEAST_CONFIDENCE, BranchName, name_branches
+from gcar_deploy.measure.naming import LEAST_CONFIDENCE, BranchName, read_anatomy
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.quality.gates import Quality
 from gcar_deploy.tree.tree import Branch, Tree
@@ -46,7 +46,7 @@ class Result:
     Attributes
     ----------
     quality : Quality
-    tree : Tree, mm LPS
+    tree : Tree, mm LPS; branches run from their inlets (``measure.inlet``)
     gaussians : Gaussians
     volume : (nx, ny, nz) float32 vessel occupancy 0 .. 1 on ``grid``
     grid : Grid
@@ -100,7 +100,7 @@ class Result:
     @functools.cached_property
     def names(self) -> tuple[BranchName | None, ...]:
         """Name of each branch (LM, LAD, LCx, RCA) with its probability; None: a number only."""
-        return name_branches(self.tree)
+        return read_anatomy(self.tree).names
 
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
@@ -119,9 +119,10 @@ class Result:
             "tree": {
                 "length_mm": self.tree.length_mm,
                 "branches": [
-                    _branch(branch, lumen, name)
-                    for branch, lumen, name in zip(
-                        self.tree.branches, branch_lumens(self.tree), self.names, strict=True
+                    {"branch": number, **_branch(branch, lumen, name)}
+                    for number, (branch, lumen, name) in enumerate(
+                        zip(self.tree.branches, branch_lumens(self.tree), self.names, strict=True),
+                        start=1,
                     )
                 ],
                 "bifurcations": bifurcations(self.tree),
@@ -216,7 +217,7 @@ def versions() -> dict[str, str | None]:
 def bifurcations(tree: Tree) -> list[dict[str, Any]]:
     """Nodes where three or more branches meet, with the angle between each two of them.
 
-    Branches are counted from 0, as in ``branches``.
+    Branches have their numbers, from 1.
     """
     found: dict[int, dict[str, Any]] = {}
     for angle in bifurcation_angles(tree):
@@ -224,7 +225,10 @@ def bifurcations(tree: Tree) -> list[dict[str, Any]]:
         node = found.setdefault(
             angle.node, {"node": angle.node, "position_mm": place, "angles": []}
         )
-        pair = {"branches": [angle.first, angle.second], "angle_deg": angle.angle_deg}
+        pair = {
+            "branches": [angle.first + 1, angle.second + 1],
+            "angle_deg": angle.angle_deg,
+        }
         node["angles"].append(pair)
     return list(found.values())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gcar_deploy.measure.naming import Reading, name_branches, probabilities, readings
+from gcar_deploy.measure.naming import Reading, probabilities, read_anatomy, readings
 from gcar_export.studies.naming_cases import NamedTree, components, named_case, right_reading
 from gcar_export.studies.naming_fit import FIGURES, Example, as_json, fit, table, tally
 from tests.measure.test_naming import left_tree
@@ -51,7 +51,7 @@ def test_the_fit_tells_right_readings_from_others():
         assert (template.weight >= 0).all() and len(template.weight) == len(FIGURES[side])
     for example in some_examples(30, rng):
         side = ("left", "right")[example.side[0]]
-        share = probabilities([Reading(side, {}, f) for f in example.figures], usual)
+        share = probabilities([Reading(side, {}, f, 0) for f in example.figures], usual)
         if example.right < 0:
             assert share.sum() < 0.2
         else:
@@ -67,4 +67,4 @@ def test_tally_counts_branches_and_their_length():
     lcx = left_tree().branches[2].length_mm
     assert counts["RCA"][3:] == pytest.approx([lcx, 0.0, lcx])
     assert f"| RCA | 1 | 0 | 1 | {lcx:.0f} | 0 | {lcx:.0f} |" in table("made", counts)
-    assert [n and n.name for n in name_branches(left_tree())] == [n or None for n in TRUE]
+    assert [n and n.name for n in read_anatomy(left_tree()).names] == [n or None for n in TRUE]

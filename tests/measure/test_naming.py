@@ -11,8 +11,8 @@ from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.measure.naming import (
     LEFT_FIGURES,
     RIGHT_FIGURES,
-    name_branches,
     probabilities,
+    read_anatomy,
     readings,
     templates,
 )
@@ -58,14 +58,14 @@ def mapped(tree, matrix):
 
 
 def names(tree):
-    return [None if name is None else name.name for name in name_branches(tree)]
+    return [None if name is None else name.name for name in read_anatomy(tree).names]
 
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_a_left_tree_as_anatomy_has_it(backwards):
     tree = left_tree(backwards=backwards)
     assert names(tree) == ["LM", "LAD", "LCx", "LAD", None]
-    assert all(0.8 <= name.confidence <= 1 for name in name_branches(tree) if name is not None)
+    assert all(0.8 <= name.confidence <= 1 for name in read_anatomy(tree).names if name is not None)
 
 
 def test_place_does_not_matter_and_a_reading_takes_all_branches_once():
@@ -93,7 +93,7 @@ def test_place_does_not_matter_and_a_reading_takes_all_branches_once():
     ids=["left is right", "front is back", "up is down", "half turn", "axes in turn", "head first"],
 )
 def test_mirrored_and_turned_trees_have_no_name(matrix):
-    assert not any(name_branches(mapped(left_tree(), matrix)))
+    assert not any(read_anatomy(mapped(left_tree(), matrix)).names)
 
 
 def test_what_lacks_its_parts_has_no_name():
@@ -106,8 +106,8 @@ def test_what_lacks_its_parts_has_no_name():
         dataclasses.replace(tree.branches[1], start=0, end=1),
         dataclasses.replace(tree.branches[2], start=0, end=2)))  # fmt: skip
     assert names(without_trunk) == [None, None]
-    assert not any(name_branches(fork())) and not any(name_branches(tube()))
-    assert name_branches(empty_tree()) == ()
+    assert not any(read_anatomy(fork()).names) and not any(read_anatomy(tube()).names)
+    assert read_anatomy(empty_tree()).names == ()
 
 
 def test_a_thick_border_fragment_is_not_the_ostium():
@@ -135,14 +135,14 @@ def test_left_tree_right_of_a_right_tree_is_a_contradiction():
     beside = names(both(np.array([-45.0, -5.0, 30.0])))
     assert beside[:4] == ["LM", "LAD", "LCx", "LAD"] and set(beside[5:7]) <= {"RCA", None}
     if "RCA" in beside:
-        assert not any(name_branches(both(np.array([95.0, -5.0, 30.0]))))
+        assert not any(read_anatomy(both(np.array([95.0, -5.0, 30.0]))).names)
 
 
 @pytest.mark.slow
 def test_the_demo_patient():
     """A real left tree that nothing was fitted to: named rightly or not at all."""
     tree = demo_tree()
-    found = dict(zip(range(len(tree.branches)), name_branches(tree), strict=True))
+    found = dict(zip(range(len(tree.branches)), read_anatomy(tree).names, strict=True))
     assert all(name is None or name.name != "RCA" for name in found.values())
     lad = [tree.branches[k].points_mm for k, n in found.items() if n and n.name == "LAD"]
     lcx = [tree.branches[k].points_mm for k, n in found.items() if n and n.name == "LCx"]

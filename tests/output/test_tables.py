@@ -149,5 +149,5 @@ def test_a_fork_tells_its_angles_and_a_short_branch_why_it_says_nothing(result):
     (node,) = summary["tree"]["bifurcations"]
     assert node["node"] == 1 and node["position_mm"] == [0, 0, 0]
     found = {tuple(a["branches"]): a["angle_deg"] for a in node["angles"]}
-    assert found == pytest.approx({(0, 1): 180.0, (0, 2): 90.0, (1, 2): 90.0})
+    assert found == pytest.approx({(1, 2): 180.0, (1, 3): 90.0, (2, 3): 90.0})
     assert "too short" in summary["reasons"]["/tree/branches/2/stenosis_percent"]
