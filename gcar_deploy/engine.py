@@ -26,7 +26,7 @@ from gcar_deploy.imaging.extract import above_half, asks_network
 from gcar_deploy.imaging.net import Segmenter, check_segmenter, load_segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.result import Result
-from gcar_deploy.predict.center_predictor import load_predictor, missing_predictor
+from gcar_deploy.predict import load_predictor, missing_predictor
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.stopwatch import OnProgress
 

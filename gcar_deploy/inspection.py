@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,8 +21,11 @@ from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
 from gcar_deploy.imaging.net import load_segmenter
-from gcar_deploy.pose.agreement import agreeing, check_consistency, order_of, with_hint
-from gcar_deploy.quality.gates import check_views
+from gcar_deploy.pose import register
+from gcar_deploy.predict import Predictor, load_predictor, quick_tree
+from gcar_deploy.quality import check_views
+from gcar_deploy.stopwatch import Stopwatch
+from gcar_deploy.tree.tree import Tree
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -102,7 +106,7 @@ def inspect_files(
             view = extract_vessels(angiogram, options.imaging, segmenter)
             entry["vessel_share"] = float(view.mask.mean())
             views.append(view)
-        found.warnings += _consistency(found, angiograms, views, options)
+        found.warnings += _registered(found, angiograms, views, grid, options)
     except GcarError as error:
         found.error = error
     return found
@@ -117,24 +121,28 @@ def volume_coverage(carm: CArm, grid: Grid) -> float:
     return float((inside & (pixels[:, 1] < carm.rows - 0.5) & (depth > 0)).mean())
 
 
-def _consistency(
-    found: Inspection,
-    angiograms: Sequence[Angiogram],
-    views: Sequence[VesselImage],
-    options: RunOptions,
-) -> list[str]:
-    views, poses, apart = agreeing(angiograms, views, options)
-    for k, pose in enumerate(poses):
-        both = {views[pose.partner].view_id, views[k].view_id}
+def _registered(
+    found: Inspection, angiograms: Sequence[Angiogram], views: Sequence[VesselImage],
+    grid: Grid, options: RunOptions,
+) -> list[str]:  # fmt: skip
+    """Register the views as ``run`` does, and state what that says of each pair."""
+
+    def tree_of(placed: Sequence[VesselImage]) -> Tree:
+        return quick_tree(placed, grid, predictor(), options, Stopwatch(()))
+
+    @functools.cache
+    def predictor() -> Predictor | None:
+        return load_predictor(None, options.predict)
+
+    placed = register(angiograms, views, options, tree_of)
+    for view, pose in zip(placed.views, placed.poses, strict=True):
+        both = {placed.views[pose.partner].view_id, view.view_id}
         for pair in found.pairs:
             if {pair["first"], pair["second"]} == both:
                 pair["disagreement"] = pose.before
-                pair["shift_mm"] = float(np.linalg.norm(pose.offset_mm))
+                pair["shift_mm"] = pose.shift_mm
                 pair["after_shift"] = pose.after
-    after, partners = [p.after for p in poses], [p.partner for p in poses]
-    order, hint = order_of(views, poses, options)
-    with with_hint(hint):
-        return apart + order + check_consistency(views, after, options.quality, partners)
+    return list(placed.or_refuse().findings)
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.tubes.model import footprint, tubes_of
+from gcar_deploy.tubes import footprint, tubes_of
 from gcar_deploy.types import Points
 
 #: pixels along each side of the pictures, and voxels along each edge of the grid

@@ -3,16 +3,36 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
 from gcar_deploy.errors import CancelledError
 
 _log = logging.getLogger(__name__)
 
+T = TypeVar("T")
 #: called with (stage, share of the whole work done, 0 .. 1)
 OnProgress = Callable[[str, float], None]
+#: what is kept of a deadline, as shares of the time that all before the refinement took: for what
+#: follows its last step (sigma, tree, volume, quality), for its start, and for a tree without it
+FINISH_SHARE, BEGIN_SHARE, UNREFINED_SHARE = 0.9, 0.5, 0.7
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """Time for a refinement.
+
+    Attributes
+    ----------
+    enough : whether it is worth beginning
+    should_stop : asked before each step; True ends with the best so far
+    """
+
+    enough: bool = True
+    should_stop: Callable[[], bool] | None = None
 
 
 class Stopwatch:
@@ -101,6 +121,26 @@ class Stopwatch:
             raise CancelledError(
                 f"the deadline of {self._deadline_s:g} s leaves no time for a result"
             )
+
+    def budget(self) -> Budget:
+        """Share out what is left between the refinement and what follows it.
+
+        Raises
+        ------
+        CancelledError
+            Cancelled, or not even a tree without refinement can be finished in time.
+        """
+        before_s = self.elapsed_s
+        self.require(UNREFINED_SHARE * before_s)
+        enough = self.left_s >= (BEGIN_SHARE + FINISH_SHARE) * before_s
+        return Budget(enough, self.leaving(FINISH_SHARE * before_s))
+
+    def each(self, items: Sequence[T], report: Callable[[float], None]) -> Iterator[T]:
+        """Yield items of equal work: each unless ``check`` raises, with the share done reported."""
+        for done, item in enumerate(items, start=1):
+            self.check()
+            yield item
+            report(done / len(items))
 
     def check(self) -> None:
         """Raise CancelledError if cancelled, or late; for stages without a usable half-result."""

@@ -11,23 +11,30 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "gcar_deploy"
-#: lower numbers never import higher ones; rooms on one floor keep apart unless listed below
+#: from the ground up: a room imports those of lower floors alone; rooms on one floor keep apart
 FLOORS = {
-    "errors": 0, "types": 0, "files": 0,
-    "config": 1, "stopwatch": 1,
-    "geometry": 2,
-    "models": 3,
-    "imaging": 4,
-    "gaussians": 5, "dicom": 5,
-    "tree": 6,
-    "predict": 7, "pose": 7, "tubes": 7, "measure": 7,
-    "quality": 8,
-    "output": 9, "selftest": 9, "data": 9,
-    "reconstruct": 10,
-    "engine": 11,
-    "inspection": 12, "worker": 12, "batch": 12, "bench": 12,
-    "cli": 13,
-}  # fmt: skip
+    room: floor
+    for floor, rooms in enumerate(
+        (
+            "errors types files",
+            "config stopwatch",
+            "geometry",
+            "models",
+            "imaging",
+            "gaussians dicom",
+            "tree",
+            "predict tubes measure",
+            "quality",
+            "pose",
+            "output selftest data",
+            "reconstruct",
+            "engine",
+            "inspection worker batch bench",
+            "cli",
+        )
+    )
+    for room in rooms.split()
+}
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load
 HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", "pydicom")
 #: the only files of the runtime that may name these libraries

@@ -9,7 +9,12 @@ import pytest
 from click.testing import CliRunner
 
 from gcar_deploy.cli.main import gcar
-from gcar_deploy.geometry.scene import Scene, View, scene_to_json
+from gcar_deploy.config import BundleOptions, PredictOptions, RefineOptions, RunOptions
+from gcar_deploy.engine import Engine
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
+from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.inspection import inspect_files, volume_coverage
 from gcar_deploy.selftest import tiny_case
 
@@ -106,3 +111,47 @@ def test_coverage_of_the_volume():
     whole = volume_coverage(carm, dataclasses.replace(grid, size_mm=(5.0, 5.0, 5.0)))
     none = volume_coverage(carm, dataclasses.replace(grid, center_mm=(300.0, 0.0, 0.0)))
     assert whole == 1.0 and none < 0.05
+
+
+def three_raw_views_with_the_table_moved():
+    """Pictures and masks of one tree; before the second the table went by 37 mm."""
+    render = pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
+    from gcar_export.scenes.trees import random_tree
+
+    vessels = random_tree(np.random.default_rng(5)).sides("left")
+    angiograms = []
+    for k, (primary, secondary) in enumerate(((-30, -20), (45, 25), (-10, 35))):
+        carm = CArm(
+            primary_angle_deg=primary, secondary_angle_deg=secondary, sod_mm=765, sdd_mm=1080,
+            rows=128, columns=128, pixel_spacing_mm=(1.8, 1.8),
+        )  # fmt: skip
+        seen = carm.moved(np.array([0.0, 12.0, 35.0])) if k == 1 else carm
+        path = render.path_lengths(seen, *vessels.segments())
+        angiograms.append(
+            Angiogram(
+                view_id=str(k + 1), carm=carm, pixels=(230 * np.exp(-0.12 * path)).astype("f4"),
+                bit_depth=8, intensity=Intensity(kind="raw"), sha256=str(k), mask=path > 0.3,
+            )
+        )  # fmt: skip
+    return angiograms, Grid(center_mm=(0, 0, 0), size_mm=(130,) * 3, shape=(64,) * 3)
+
+
+def test_three_views_are_placed_as_run_places_them():
+    """Also by the tree that they show, and what is said of the correction is the same."""
+    angiograms, grid = three_raw_views_with_the_table_moved()
+    options = RunOptions(
+        predict=PredictOptions(predictor="none"), refine=RefineOptions(refiner="none"),
+        bundle=BundleOptions(least_px=0.0),
+    )  # fmt: skip
+    result = Engine(threads=1, options=options).reconstruct(angiograms, grid)
+    found = inspect_files(angiograms, grid, options)
+    assert found.error is None
+    said = result.quality.findings[: len(found.warnings)]
+    assert found.warnings == list(said)
+    assert any("view 2 had to be moved" in text for text in said)
+    first, second, third = result.poses
+    assert second.shift_mm > 15 and first.shift_mm == 0
+    pairs = {(pair["first"], pair["second"]): pair for pair in found.pairs}
+    for view, pose in (("2", second), ("3", third)):
+        pair = pairs[min(str(pose.partner + 1), view), max(str(pose.partner + 1), view)]
+        assert pair["shift_mm"] == pose.shift_mm and pair["after_shift"] == pose.after

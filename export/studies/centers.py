@@ -11,42 +11,24 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.measure.metrics import skeleton
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
+from gcar_deploy.predict.centers import Seen, seen_by_all
 from gcar_deploy.predict.decision import decide
-from gcar_deploy.predict.encoding import Encoded, encode
-from gcar_deploy.predict.hull import Candidates
 from gcar_deploy.predict.single_view import merge_views
-from gcar_deploy.reconstruct import seen_by_all
 from gcar_deploy.types import Points, Volume
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Posed:
-    """An examination as a predictor meets it, at the angles that it is told.
-
-    Attributes
-    ----------
-    views : vessel images
-    hull, encoded : what the views leave on the lattice
-    """
-
-    views: list[VesselImage]
-    hull: Candidates
-    encoded: Encoded
-
-
-def pose(angiograms: Sequence[Angiogram], grid: Grid) -> Posed:
+def pose(angiograms: Sequence[Angiogram], grid: Grid) -> Seen:
     """Find vessels and hull as ``reconstruct`` does, without correcting poses."""
     options = RunOptions()
     views = [extract_vessels(a, options.imaging) for a in angiograms]
-    hull, known = seen_by_all(views, grid, options)
-    return Posed(views, hull, encode(hull, known))
+    return seen_by_all(views, grid, options)
 
 
-def predicted(predictor: Predictor, posed: Posed) -> dict[str, Points]:
+def predicted(predictor: Predictor, posed: Seen) -> dict[str, Points]:
     """Predicted centres, (n, 3) mm LPS each, by the name of their row.
 
     ``multi``: hull points decided to be vessel, moved by their offset to the centreline.

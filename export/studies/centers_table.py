@@ -14,6 +14,7 @@ import numpy as np
 from gcar_deploy.errors import UsageError
 from gcar_deploy.predict.center_map import net_picture
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor, open_predictor
+from gcar_deploy.predict.centers import Seen
 from gcar_deploy.predict.encoding import flat_inputs
 from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
 from gcar_deploy.types import Array
@@ -22,7 +23,7 @@ from gcar_export.evaluate.protocols import Case, make_case
 from gcar_export.methods.predictor_process import peak_mib
 from gcar_export.methods.rtk_timing import pair_carms, projection_pair
 from gcar_export.scenes.labels import read_label
-from gcar_export.studies.centers import Posed, Truth, pose, predicted
+from gcar_export.studies.centers import Truth, pose, predicted
 
 #: how near counts, voxels of the protocol's grid (1.41 mm paper, 1 mm clinical)
 REACH_VOXELS = 1.5
@@ -155,14 +156,14 @@ def _pair(case: Case) -> Callable[[], None]:
     return run
 
 
-def _inference(predictor: Predictor, posed: Posed) -> Callable[[], Any]:
+def _inference(predictor: Predictor, posed: Seen) -> Callable[[], Any]:
     if isinstance(predictor, SingleViewPredictor):
         views = [(view.carm, view.path_mm) for view in posed.views]
         return lambda: predictor.predict(views)
     return lambda: predictor.predict(posed.hull, posed.encoded)
 
 
-def _feed(predictor: Predictor, posed: Posed) -> dict[str, Array]:
+def _feed(predictor: Predictor, posed: Seen) -> dict[str, Array]:
     """Return one inference's inputs by name; of the first view for a single-view model."""
     if isinstance(predictor, SingleViewPredictor):
         carm, path = posed.views[0].carm, posed.views[0].path_mm

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import QualityOptions
-from gcar_deploy.pose import agreement
-from gcar_deploy.quality import gates as quality
+from gcar_deploy.quality.gates import check_order, disagreement_limits
+from gcar_deploy.quality.status import DEGRADED, OK, REFUSED
 from gcar_export.studies.gate_pairs import KINDS, PICTURES, UNITS, WRONG
 from gcar_export.studies.gate_table import GATES, Row, choose, cost, replayed, with_gate
 
-_STATUSES = (quality.OK, quality.DEGRADED, quality.REFUSED)
+_STATUSES = (OK, DEGRADED, REFUSED)
 
 
 def status_table(rows: Sequence[Row], gates: QualityOptions) -> str:
@@ -44,7 +44,7 @@ def _status_line(own: Sequence[Row], pictures: str, kind: str, gates: QualityOpt
     ratios = [r.other_order / max(r.whole.disagreement, 1e-9) for r in own if r.other_order]
     covered = [min(c or 0.0 for c in r.whole.coverage) for r in own if r.whole.coverage]
     seen = [min(c or 0.0 for c in r.whole.support) for r in own if r.whole.support]
-    ok, degraded = by[quality.OK], by[quality.DEGRADED]
+    ok, degraded = by[OK], by[DEGRADED]
     cells = [
         pictures, kind, str(len(own)), " / ".join(str(len(by[s])) for s in _STATUSES), str(told),
         _spread([r.whole.disagreement for r in own], 100), _spread(ratios, 1),
@@ -57,7 +57,7 @@ def _status_line(own: Sequence[Row], pictures: str, kind: str, gates: QualityOpt
 def _hint(row: Row, gates: QualityOptions) -> str:
     calibrated = row.pictures == "path length"
     disagreement = row.whole.disagreement
-    return agreement.check_order(("1", "2"), disagreement, row.other_order, calibrated, gates)[1]
+    return check_order(("1", "2"), disagreement, row.other_order, calibrated, gates)[1]
 
 
 def level_table(rows: Sequence[Row], gates: QualityOptions) -> str:
@@ -108,7 +108,7 @@ def doubt_table(rows: Sequence[Row], gates: QualityOptions) -> str:
             r for r in doubted if min([c or 0.0 for c in r.whole.coverage] or [0.0])
             < gates.good_coverage
         ]  # fmt: skip
-        oks = [sum(replayed(r, g) == quality.OK for r in part) for g in (gates, unasked)]
+        oks = [sum(replayed(r, g) == OK for r in part) for g in (gates, unasked)]
         cells = [name, *map(str, (len(part), len(doubted), len(short), *oks))]
         out.append("| " + " | ".join(cells) + " |")
     return "\n".join(out)
@@ -155,7 +155,7 @@ def draw(rows: Sequence[Row], gates: QualityOptions, file: Path) -> None:
     for k, pictures in enumerate(PICTURES):
         own = [r for r in rows if r.pictures == pictures]
         raw = pictures == "raw"
-        good, most = agreement.disagreement_limits(not raw, gates)
+        good, most = disagreement_limits(not raw, gates)
         _histogram(figure.add_subplot(2, 2, 1 + k), own, pictures, (good, most))
         panel = figure.add_subplot(2, 2, 3 + k)
         for kind, colour in (("same", "C0"), ("two trees", "0.6"), ("swapped", "C3")):

@@ -42,8 +42,8 @@ from gcar_deploy.imaging.net import Segmenter, load_segmenter
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.measure.metrics import volume_dice
 from gcar_deploy.pose import agreement
-from gcar_deploy.quality import gates as quality
-from gcar_deploy.quality.gates import ViewQuality
+from gcar_deploy.quality.gates import check_agreement, check_order
+from gcar_deploy.quality.status import DEGRADED, OK, REFUSED, ViewQuality, check_explained
 from gcar_export.evaluate.protocols import case_geometry
 from gcar_export.studies.gate_pairs import (
     KINDS,
@@ -57,8 +57,8 @@ from gcar_export.studies.gate_pairs import (
 from gcar_export.studies.pose_table import aligned, chamfer_mm
 
 #: cost of a status where the views show one tree, and where they contradict each other
-COST_TRUE = {quality.OK: 0.0, quality.DEGRADED: 0.25, quality.REFUSED: 1.0}
-COST_WRONG = {quality.OK: 3.0, quality.DEGRADED: 0.5, quality.REFUSED: 0.0}
+COST_TRUE = {OK: 0.0, DEGRADED: 0.25, REFUSED: 1.0}
+COST_WRONG = {OK: 3.0, DEGRADED: 0.5, REFUSED: 0.0}
 #: volume DSC from which on a tree has come out
 CAME_OUT = 0.5
 #: gates that change the sum by less are left as they are
@@ -308,18 +308,18 @@ def replayed(row: Row, gates: QualityOptions) -> str:
         )
     ]  # fmt: skip
     if attempt.refused:
-        return quality.REFUSED
+        return REFUSED
     findings: list[str] = list(attempt.findings)
     if attempt is row.whole:  # the parts alone are ``degraded`` in any case
-        findings += agreement.check_order(
+        findings += check_order(
             ("1", "2"), attempt.disagreement, row.other_order, calibrated, gates
         )[0]
     try:
-        findings += agreement.check_agreement(("1", "2"), attempt.disagreement, calibrated, gates)
-        findings += quality.check_explained(views, attempt.disagreement, calibrated, gates)
+        findings += check_agreement(("1", "2"), attempt.disagreement, calibrated, gates)
+        findings += check_explained(views, attempt.disagreement, calibrated, gates)
     except RefusedError:
-        return quality.REFUSED
-    return quality.DEGRADED if findings else quality.OK
+        return REFUSED
+    return DEGRADED if findings else OK
 
 
 def cost(rows: Sequence[Row], gates: QualityOptions) -> float:

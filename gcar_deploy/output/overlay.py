@@ -12,7 +12,7 @@ from gcar_deploy.config import QualityOptions
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.quality.gates import ViewQuality, unexplained
+from gcar_deploy.quality import ViewQuality, unexplained
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Image, Mask, Pixels
 

@@ -22,8 +22,8 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.measure.further_view import best_further_view
 from gcar_deploy.measure.lumen import BranchLumen, bifurcation_angles, branch_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE, BranchName, read_anatomy
-from gcar_deploy.pose.pairwise import Pose
-from gcar_deploy.quality.gates import Quality
+from gcar_deploy.pose import Pose
+from gcar_deploy.quality import Quality
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Volume
 

@@ -1,24 +1,20 @@
-"""Agreement of the views along the epipolar lines: as told, moved, in parts, in the other order.
-
-First what is measured, before there is any tree; then what follows for the status.
-"""
+"""Agreement of the views along the epipolar lines: as told, moved, in parts, in the other order."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from gcar_deploy.config import QualityOptions, RunOptions
-from gcar_deploy.errors import RefusedError
+from gcar_deploy.config import RunOptions
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
+from gcar_deploy.quality.gates import check_order, disagreement_limits
 
 _log = logging.getLogger(__name__)
 
@@ -140,109 +136,3 @@ def order_of(
         return [], ""  # nothing to be asked, and no time spent on it
     ids, other = (first.view_id, second.view_id), other_order(views, options)
     return check_order(ids, given, other, calibrated, options.quality)
-
-
-def disagreement_limits(calibrated: bool, options: QualityOptions) -> tuple[float, float]:
-    """Disagreement above which views are doubted, and above which they are refused."""
-    if calibrated:
-        return options.good_disagreement, options.max_disagreement
-    return options.good_disagreement_raw, options.max_disagreement_raw
-
-
-def check_consistency(
-    views: Sequence[VesselImage],
-    disagreement: Sequence[float],
-    options: QualityOptions,
-    partners: Sequence[int] | None = None,
-) -> list[str]:
-    """Judge whether the views can show one tree.
-
-    Parameters
-    ----------
-    views : V vessel images
-    disagreement : (V,) of each view's epipolar profile with its partner's, 0 .. 1
-    partners : (V,) which view each was compared with; the first where left out
-
-    Raises
-    ------
-    RefusedError
-        The views contradict each other.
-    """
-    findings = []
-    for k, (view, value) in enumerate(zip(views, disagreement, strict=True)):
-        other = views[partners[k] if partners else 0]
-        calibrated = other.calibrated and view.calibrated
-        findings += check_agreement((other.view_id, view.view_id), value, calibrated, options)
-    return findings
-
-
-def check_agreement(
-    view_ids: tuple[str, str], disagreement: float, calibrated: bool, options: QualityOptions
-) -> list[str]:
-    """Judge the disagreement of two views, 0 .. 1; returns and raises as ``check_consistency``."""
-    first, second = view_ids
-    good, most = disagreement_limits(calibrated, options)
-    if disagreement > most:
-        raise RefusedError(
-            f"views {first} and {second} contradict each other: the vessels "
-            f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
-            "different patients, frames or angles?"
-        )
-    if disagreement > (good if calibrated else min(good, options.sure_disagreement_raw)):
-        return [
-            f"view {second} agrees poorly with view {first}: {disagreement:.0%} of "
-            "the vessel differs along the epipolar lines"
-        ]
-    return []
-
-
-def check_order(
-    view_ids: tuple[str, str],
-    disagreement: float,
-    other_order: float | None,
-    calibrated: bool,
-    options: QualityOptions,
-) -> tuple[list[str], str]:
-    """Judge whether two pictures could have been given in the wrong order.
-
-    Parameters
-    ----------
-    view_ids : of both views
-    disagreement : of the pictures as they were given, corrected, 0 .. 1
-    other_order : with each other's geometry as it is told; None where they cannot be swapped
-    calibrated : whether both pictures are
-
-    Returns
-    -------
-    findings : that make the result ``degraded``
-    hint : what a refusal should say as well; empty where the pictures need not be swapped
-    """
-    good, _ = disagreement_limits(calibrated, options)
-    # Opposite views are not compared, which leaves 0.
-    if other_order is None or disagreement <= (good if calibrated else 0.0):
-        return [], ""
-    first, second = view_ids
-    instead = (
-        f"the other way round ({other_order:.0%} of the vessels differ, not {disagreement:.0%})"
-    )
-    if other_order <= min(good, options.swapped_ratio * disagreement):
-        hint = f"views {first} and {second} agree far better {instead}: are the pictures swapped?"
-        return [hint], hint
-    if other_order <= options.order_ratio * disagreement:
-        return [
-            f"views {first} and {second} agree about as well {instead}: the pictures do not tell "
-            "whether they are swapped"
-        ], ""
-    return [], ""
-
-
-@contextlib.contextmanager
-def with_hint(hint: str) -> Iterator[None]:
-    """Let a refusal say as well what may be the reason; an empty hint adds nothing."""
-    try:
-        yield
-    except RefusedError as error:
-        if not hint:
-            raise
-        end = "" if str(error).endswith("?") else "."
-        raise RefusedError(f"{error}{end} {hint[0].upper()}{hint[1:]}") from None

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.pose.agreement import poses_between
 from gcar_deploy.pose.bundle_adjustment import adjust
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.tree.tree import Tree
 
+#: makes a tree of views that have their corrections built in
+TreeOf: TypeAlias = Callable[[Sequence[VesselImage]], Tree]
 #: a view that moves by less than this between rounds has arrived, mm
 ARRIVED_MM = 0.5
 
@@ -21,7 +25,7 @@ ARRIVED_MM = 0.5
 def bundled(
     views: Sequence[VesselImage],
     poses: Sequence[Pose],
-    tree_of: Callable[[Sequence[VesselImage]], Tree],
+    tree_of: TreeOf,
     options: RunOptions,
 ) -> tuple[Pose, ...]:
     """Fit tree and poses to each other in turn.
@@ -29,19 +33,19 @@ def bundled(
     Parameters
     ----------
     views : V vessel images as they are told
-    poses : their corrections by mass profiles (``refine.pose``)
+    poses : their corrections by mass profiles (``poses_between``)
     tree_of : makes a tree of views that have their corrections built in
     options : RunOptions
 
     Returns
     -------
-    V poses: as given with fewer than three views, where no view had to be moved, where all
-    pictures are calibrated (their profiles place them more exactly than lines do), or where the
-    adjustment does not bring the tree clearly nearer to the pictures
+    V poses with what the profiles say of them: as given with fewer than three views, where no
+    view had to be moved, where all pictures are calibrated (their profiles place them more exactly
+    than lines do), or where the adjustment does not bring the tree clearly nearer to the pictures
     """
     o = options.bundle
     told = [view.carm for view in views]
-    poses = tuple(poses)
+    first = poses = tuple(poses)
     if len(views) < 3 or not options.pose.enabled or all(view.calibrated for view in views):
         return poses
     if not any(pose.theta.any() for pose in poses):
@@ -57,7 +61,7 @@ def bundled(
         poses = tuple(_at(pose, t) for pose, t in zip(poses, found.theta, strict=True))
         if np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM:
             break
-    return poses
+    return first if poses == first else poses_between(views, options, poses)
 
 
 def posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -1,1 +1,14 @@
 """Quality: whether a tree can honestly be made, and how far to trust it."""
+
+from gcar_deploy.quality.gates import check_candidates, check_tree, check_views
+from gcar_deploy.quality.status import Quality, ViewQuality, judge, unexplained
+
+__all__ = [
+    "Quality",
+    "ViewQuality",
+    "check_candidates",
+    "check_tree",
+    "check_views",
+    "judge",
+    "unexplained",
+]

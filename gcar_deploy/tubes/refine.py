@@ -8,12 +8,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy.config import RefineOptions, TreeOptions
-from gcar_deploy.errors import UsageError
+from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.gaussians.voxelize import voxelize
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.stopwatch import Budget
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
@@ -22,8 +23,11 @@ from gcar_deploy.tubes.volume import tube_volume
 from gcar_deploy.types import Array, Volume
 
 REFINERS = ("tube", "paper", "none")
-ShouldStop = Callable[[], bool]
 OnProgress = Callable[[float], None]
+_FINDINGS = {
+    "late": "the deadline left no time to refine",
+    "stopped": "the deadline ended the refinement early",
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,13 +38,13 @@ class Refined:
     ----------
     refiner : str
     gaussians : Gaussians, possibly none
-    tree : Tree or None
-        None where the refiner makes no tree of its own (``paper``).
+    tree : Tree
+        Made of ``centers`` as they are where the refiner has none of its own (``paper``).
     losses : (k,) objective after each accepted step
     steps, rejected_steps : int
     status : str
-        ``ok``; ``stopped`` (deadline or cancel: the best so far); ``failed`` (not finite);
-        ``empty`` (nothing to refine).
+        ``ok``; ``stopped`` (deadline or cancel: the best so far); ``late`` (no time to begin);
+        ``failed`` (not finite); ``empty`` (nothing to refine).
     contrast : (views,) factor of each picture's path on the model's, 1 where calibrated
     centers : CenterPoints the refinement started from
     model_mm : per view (rows, cols) path of the fitted tubes, mm; empty where not at hand
@@ -48,7 +52,7 @@ class Refined:
 
     refiner: str
     gaussians: Gaussians
-    tree: Tree | None
+    tree: Tree
     losses: tuple[float, ...]
     steps: int
     rejected_steps: int
@@ -57,13 +61,24 @@ class Refined:
     centers: CenterPoints
     model_mm: tuple[Array, ...] = ()
 
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Reasons for ``degraded``."""
+        return (_FINDINGS[self.status],) if self.status in _FINDINGS else ()
+
+    def or_fail(self) -> Refined:
+        """Return itself; raise NumericalError where the refinement failed."""
+        if self.status == "failed":
+            raise NumericalError("the refinement left the finite numbers")
+        return self
+
 
 def refine(
     centers: CenterPoints,
     views: Sequence[VesselImage],
     options: RefineOptions | None = None,
     on_progress: OnProgress | None = None,
-    should_stop: ShouldStop | None = None,
+    budget: Budget | None = None,
     *,
     tree_options: TreeOptions | None = None,
 ) -> Refined:
@@ -75,7 +90,7 @@ def refine(
     views : sequence of VesselImage
     options : RefineOptions; ``refiner`` picks the method
     on_progress : called with the share done, 0 .. 1
-    should_stop : asked before each step; True ends with the best so far
+    budget : Budget; all the time where left out
     tree_options : TreeOptions for the refiners that build a tree
 
     Raises
@@ -88,11 +103,15 @@ def refine(
         raise UsageError(f"refiner {options.refiner!r} is none of {', '.join(REFINERS)}")
     if not views:
         raise UsageError("refinement needs at least one view")
-    if options.refiner == "paper":
-        return _paper(centers, views, options, on_progress, should_stop)
-    if options.refiner == "none":
-        return _unrefined(centers, len(views), options, tree_options)
-    fit = fit_tubes(centers, views, options.tube, tree_options, should_stop)
+    budget = budget or Budget()
+    if not budget.enough or options.refiner != "tube":
+        start = _unrefined(centers, len(views), tree_options)
+        if not budget.enough:
+            return dataclasses.replace(start, status="late")
+        if options.refiner == "none":
+            return start
+        return _paper(start, views, options, on_progress, budget.should_stop)
+    fit = fit_tubes(centers, views, options.tube, tree_options, budget.should_stop)
     if on_progress is not None:
         on_progress(1.0)
     status = "ok" if fit.tree.branches else "empty"
@@ -117,7 +136,7 @@ def refined_volume(
 ) -> Volume:
     """Vessel occupancy 0 .. 1 of each voxel of ``grid``, (nx, ny, nz) float32."""
     options = options or RefineOptions()
-    if refined.tree is None:
+    if refined.refiner == "paper":
         return np.clip(voxelize(refined.gaussians, grid), 0.0, 1.0)
     if refined.refiner == "none":
         views = ()
@@ -133,9 +152,7 @@ def refined_volume(
     )
 
 
-def _unrefined(
-    centers: CenterPoints, views: int, options: RefineOptions, tree_options: TreeOptions | None
-) -> Refined:
+def _unrefined(centers: CenterPoints, views: int, tree_options: TreeOptions | None) -> Refined:
     """Tree and Gaussians straight from the points."""
     tree = build_tree(centers, tree_options)
     return Refined(
@@ -152,25 +169,24 @@ def _unrefined(
 
 
 def _paper(
-    centers: CenterPoints,
+    start: Refined,
     views: Sequence[VesselImage],
     options: RefineOptions,
     on_progress: OnProgress | None,
-    should_stop: ShouldStop | None,
+    should_stop: Callable[[], bool] | None,
 ) -> Refined:
     from gcar_deploy.gaussians.paper import refine_paper
 
     out = refine_paper(
-        centers, views, options.paper, on_progress=on_progress, should_stop=should_stop
+        start.centers, views, options.paper, on_progress=on_progress, should_stop=should_stop
     )
-    return Refined(
+    return dataclasses.replace(
+        start,
         refiner="paper",
         gaussians=out.gaussians,
-        tree=None,
         losses=tuple(out.losses),
         steps=out.steps,
         rejected_steps=out.rejected_steps,
         status=out.status,
         contrast=out.contrast,
-        centers=centers,
     )

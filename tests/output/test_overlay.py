@@ -11,7 +11,7 @@ from gcar_deploy.config import QualityOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.output.overlay import branch_color, grey8, overlay, png_bytes
-from gcar_deploy.quality.gates import ViewQuality, unexplained, view_quality
+from gcar_deploy.quality.status import ViewQuality, unexplained, view_quality
 from gcar_deploy.tree.tree import Branch, Tree, empty_tree
 
 RED = (60, 40, 255)

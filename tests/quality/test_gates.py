@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pytest
 
 from gcar_deploy.config import ImagingOptions, QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.pose.agreement import check_consistency, check_order, with_hint
 from gcar_deploy.quality.gates import (
-    assess,
     best_separation,
     check_candidates,
+    check_consistency,
+    check_order,
     check_poses,
     check_tree,
     check_views,
-    view_quality,
+    with_hint,
 )
 from gcar_deploy.selftest import tiny_case
-from gcar_deploy.tree.tree import Tree, empty_tree
+from gcar_deploy.tree.tree import empty_tree
 
 OPTIONS = QualityOptions()
 
@@ -107,41 +106,6 @@ def test_a_hint_joins_a_refusal(error, hint, said):
     assert str(refused.value) == said
 
 
-def test_the_true_tree_is_ok_and_covers_everything(case):
-    _, views, tree = case
-    judged = assess(tree, views, [v.mask for v in views], [], 0.01, OPTIONS)
-    assert judged.status == "ok" and not judged.findings
-    for view in judged.views:
-        assert view.coverage > 0.97 and view.support > 0.97
-        assert view.overlap == 1.0 and view.distance_mm < 0.6
-
-
-def test_a_missing_branch_lowers_coverage_and_a_ghost_lowers_support(case):
-    _, views, tree = case
-    part = dataclasses.replace(tree, branches=tree.branches[:2])
-    judged = assess(part, views, [v.mask for v in views], [], None, OPTIONS)
-    assert judged.status == "degraded" and "explained" in judged.sentence
-    ghost = dataclasses.replace(
-        tree.branches[1], points_mm=tree.branches[1].points_mm + np.array([0.0, 0.0, 12.0])
-    )
-    more = dataclasses.replace(tree, branches=(*tree.branches, ghost))
-    quality = view_quality(more, views[0], views[0].mask, OPTIONS)
-    assert quality.coverage > 0.97 and quality.support < 0.9
-
-
-def test_a_tree_somewhere_else_is_refused(case):
-    _, views, tree = case
-    shift = np.array([0.0, 0.0, 40.0])
-    away = Tree(
-        nodes_mm=tree.nodes_mm + shift,
-        branches=tuple(
-            dataclasses.replace(b, points_mm=b.points_mm + shift) for b in tree.branches
-        ),
-    )
-    with pytest.raises(RefusedError, match="only"):
-        assess(away, views, [v.mask for v in views], [], None, OPTIONS)
-
-
 def test_too_little(case):
     with pytest.raises(RefusedError, match="mm of vessel"):
         check_tree(empty_tree(), OPTIONS)
@@ -151,22 +115,6 @@ def test_too_little(case):
     check_candidates(1000, lattice, OPTIONS)
 
 
-def test_undefined_figures_are_none(case):
-    _, views, _ = case
-    quality = view_quality(empty_tree(), views[0], np.zeros_like(views[0].mask), OPTIONS)
-    assert quality.coverage is None and quality.support is None and quality.overlap == 0.0
-
-
-def test_doubtful_views_that_no_tree_explains_contradict(case):
-    _, views, tree = case
-    part = dataclasses.replace(tree, branches=tree.branches[:2])
-    masks = [v.mask for v in views]
-    with pytest.raises(RefusedError, match="contradict"):
-        assess(part, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS)
-    assert assess(part, views, masks, [], OPTIONS.good_disagreement, OPTIONS).status == "degraded"
-    assert assess(tree, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS).status == "ok"
-
-
 def test_a_large_correction_between_the_runs_is_degraded(case):
     views = case[1]
     limit, turn = OPTIONS.good_shift_mm, OPTIONS.good_turn_deg
@@ -174,11 +122,3 @@ def test_a_large_correction_between_the_runs_is_degraded(case):
     for correction in ((limit + 0.1, 0.0), (0.0, turn + 0.1)):
         (finding,) = check_poses(views, [(0.0, 0.0), correction], OPTIONS)
         assert "view 2 had to be moved" in finding
-
-
-def test_match_rate_and_strict_coverage(case):
-    _, views, tree = case
-    quality = view_quality(tree, views[0], views[0].mask, OPTIONS, views[1])
-    assert quality.match_rate > 0.97 and 0.0 < quality.foreshortening < 0.5
-    assert quality.coverage_2px <= quality.coverage
-    assert view_quality(tree, views[0], views[0].mask, OPTIONS).match_rate is None

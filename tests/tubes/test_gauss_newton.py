@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import RefineOptions, TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.stopwatch import Budget
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
@@ -192,7 +193,9 @@ def test_stop_is_asked_before_each_step():
         calls.append(1)
         return len(calls) > 2
 
-    refined = refine(points_of(truth, grid(64)), seen(truth, two_views()), should_stop=stop)
+    refined = refine(
+        points_of(truth, grid(64)), seen(truth, two_views()), budget=Budget(should_stop=stop)
+    )
     assert refined.status == "stopped"
     assert refined.steps <= 2
     assert refined.tree.branches

@@ -1,0 +1,57 @@
+"""The vessels of all views, by whoever is asked for them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import asked_network, extract_vessels
+from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.stopwatch import Stopwatch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Vessels:
+    """What is vessel in every view.
+
+    Attributes
+    ----------
+    views : V vessel images
+    segmenter : the network that was asked, or None
+    findings : reasons for ``degraded``
+    """
+
+    views: tuple[VesselImage, ...]
+    segmenter: Segmenter | None
+    findings: tuple[str, ...]
+
+
+def find_vessels(
+    angiograms: Sequence[Angiogram],
+    options: ImagingOptions,
+    segmenter: Segmenter | None,
+    watch: Stopwatch,
+    report: Callable[[float], None],
+) -> Vessels:
+    """Find the vessels of every view; see ``extract_vessels``.
+
+    Parameters
+    ----------
+    angiograms : V pictures
+    options, segmenter : as of ``extract_vessels``
+    watch : Stopwatch, asked between the views and while the network runs
+    report : told the share done
+
+    Raises
+    ------
+    RefusedError, GeometryError
+        As ``extract_vessels``.
+    CancelledError
+        Cancelled or late.
+    """
+    used, missing = asked_network(angiograms, options, segmenter)
+    watched = used and used.watched(watch.question)
+    views = [extract_vessels(a, options, watched) for a in watch.each(angiograms, report)]
+    return Vessels(views=tuple(views), segmenter=used, findings=tuple(missing))

@@ -1,0 +1,94 @@
+"""Registration of the views to each other: what ``run`` and ``validate`` both ask before a tree."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.errors import RefusedError
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.pose.agreement import agreeing, order_of
+from gcar_deploy.pose.bundling import TreeOf, bundled, posed
+from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.quality.gates import check_consistency, check_poses, with_hint
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Registered:
+    """Views where they stand to each other.
+
+    Attributes
+    ----------
+    views : V vessel images with their corrections built in; of raw pictures at times only what
+        agrees of each
+    poses : the corrections, one per view, the first of them zero
+    findings : reasons for ``degraded``
+    hint : what a refusal should say as well; mostly empty
+    refusal : why the views cannot show one tree; empty where they can
+    """
+
+    views: tuple[VesselImage, ...]
+    poses: tuple[Pose, ...]
+    findings: tuple[str, ...]
+    hint: str
+    refusal: str
+
+    @property
+    def disagreement(self) -> float:
+        """Worst disagreement of a view with its partner after the corrections, 0 .. 1."""
+        return max(pose.after for pose in self.poses)
+
+    def or_refuse(self) -> Registered:
+        """Return itself; raise RefusedError where the views contradict each other."""
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        return self
+
+    def hinting(self) -> contextlib.AbstractContextManager[None]:
+        """Let a refusal of a later stage say the hint as well."""
+        return with_hint(self.hint)
+
+
+def register(
+    angiograms: Sequence[Angiogram],
+    views: Sequence[VesselImage],
+    options: RunOptions,
+    tree_of: TreeOf,
+) -> Registered:
+    """Estimate where the views stand, and judge whether they can show one tree.
+
+    Parameters
+    ----------
+    angiograms : V pictures as they were given
+    views : what was found in them, V
+    options : RunOptions
+    tree_of : makes a quick tree of views that have their corrections built in; asked only for
+        three and more views that do not agree as they are told
+
+    Returns
+    -------
+    Registered
+        Also of views that contradict each other: ``or_refuse`` raises then.
+    """
+    views, poses, findings = agreeing(angiograms, views, options)
+    poses = bundled(views, poses, tree_of, options)
+    order, hint = order_of(views, poses, options)
+    findings += order
+    moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
+    findings += check_poses(views, moves, options.quality)
+    after, partners = [pose.after for pose in poses], [pose.partner for pose in poses]
+    refusal = ""
+    try:
+        with with_hint(hint):
+            findings += check_consistency(views, after, options.quality, partners)
+    except RefusedError as error:
+        refusal = str(error)
+    return Registered(
+        views=tuple(posed(view, pose) for view, pose in zip(views, poses, strict=True)),
+        poses=poses,
+        findings=tuple(findings),
+        hint=hint,
+        refusal=refusal,
+    )

@@ -1,0 +1,150 @@
+"""From views to the points that are vessel: the hull of all views, and what it is thinned by."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.resample import sampled_path
+from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
+from gcar_deploy.predict.decision import decide
+from gcar_deploy.predict.encoding import Encoded, encode
+from gcar_deploy.predict.hull import Candidates, cubic_lattice, visual_hull
+from gcar_deploy.predict.lattices import mean_evidence, near_evidence, shifted_lattice
+from gcar_deploy.predict.single_view import merge_views
+from gcar_deploy.predict.thinning import thin_hull
+from gcar_deploy.stopwatch import Stopwatch
+from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.tree import Tree, empty_tree
+from gcar_deploy.types import Array, Image
+
+_THINNED = "no model was used: depth was decided by thinning the visual hull"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seen:
+    """What all views see as vessel.
+
+    Attributes
+    ----------
+    views : V vessel images as they are placed
+    sampled : per view C-arm, path_mm as finely as the lattice, and whether paths are true mm
+    hull : n lattice points, possibly none
+    encoded : what each view shows at and around them
+    """
+
+    views: tuple[VesselImage, ...]
+    sampled: tuple[tuple[CArm, Image, bool], ...]
+    hull: Candidates
+    encoded: Encoded
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the predictor of all views said of every point of the hull, before any decision.
+
+    Attributes
+    ----------
+    points : n CenterPoints
+    ray : (V, n) int64, ray of each point
+    weight : (V, n) float32, path length of the ray in the point's cell
+    """
+
+    points: CenterPoints
+    ray: Array
+    weight: Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Centers:
+    """Which points are vessel.
+
+    Attributes
+    ----------
+    points : CenterPoints with decided confidences
+    evidence : Evidence; None where no predictor saw all views at once
+    findings : reasons for ``degraded``
+    """
+
+    points: CenterPoints
+    evidence: Evidence | None = None
+    findings: tuple[str, ...] = ()
+
+
+def seen_by_all(views: Sequence[VesselImage], grid: Grid, options: RunOptions) -> Seen:
+    """Find the points of a lattice over ``grid`` that all views see as vessel."""
+    lattice = cubic_lattice(grid, cell_mm(grid, options))
+    paths = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
+    hull = visual_hull(paths, lattice, options.candidates)
+    sampled = tuple((*p, view.calibrated) for p, view in zip(paths, views, strict=True))
+    return Seen(tuple(views), sampled, hull, encode(hull, sampled))
+
+
+def cell_mm(grid: Grid, options: RunOptions) -> float:
+    """Return the edge of the lattice: the grid's own where the predictor knows such cells."""
+    own = float(np.mean(grid.spacing_mm))
+    return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
+
+
+def find_centers(
+    seen: Seen, predictor: Predictor | None, options: RunOptions, watch: Stopwatch
+) -> Centers:
+    """Decide which points of the hull are vessel.
+
+    Parameters
+    ----------
+    seen : Seen
+    predictor : of either kind, or None to thin the hull instead
+    options : RunOptions
+    watch : Stopwatch, asked while the model runs
+
+    Raises
+    ------
+    CancelledError
+        Cancelled or late.
+    """
+    if predictor is None:
+        thinned = thin_hull(seen.hull, seen.encoded, options.candidates)
+        return Centers(thinned, findings=(_THINNED,))
+    stop = watch.question
+    if isinstance(predictor, SingleViewPredictor):
+        alone = predictor.predict([(view.carm, view.path_mm) for view in seen.views], stop)
+        single = options.predict.single
+        merged = merge_views(alone, seen.hull, seen.encoded, options.candidates, single)
+        return Centers(merged)
+    told = predictor.predict(seen.hull, seen.encoded, stop)
+    others = []
+    for look in range(1, options.predict.looks):
+        lattice = shifted_lattice(seen.hull.lattice, look)
+        near = near_evidence(seen.hull, told.confidence, look, options.predict.look_again)
+        paths = [(carm, path) for carm, path, _ in seen.sampled]
+        other = visual_hull(paths, lattice, options.candidates, near)
+        if len(other):
+            others.append((other, predictor.predict(other, encode(other, seen.sampled), stop)))
+    told = mean_evidence(told, others)
+    error = max(view.path_error for view in seen.views)
+    decided = decide(told, seen.encoded, error, options.decide)
+    return Centers(decided, Evidence(told, seen.encoded.ray, seen.encoded.weight))
+
+
+def quick_tree(
+    views: Sequence[VesselImage],
+    grid: Grid,
+    predictor: Predictor | None,
+    options: RunOptions,
+    watch: Stopwatch,
+) -> Tree:
+    """Make a tree that is good enough to say where the views stand; possibly empty."""
+    seen = seen_by_all(views, grid, options)
+    watch.check()
+    if len(seen.hull) == 0:
+        return empty_tree()
+    once = dataclasses.replace(options, predict=dataclasses.replace(options.predict, looks=1))
+    return build_tree(find_centers(seen, predictor, once, watch).points, options.tree)

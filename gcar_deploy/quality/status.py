@@ -1,0 +1,297 @@
+"""Status: how far to trust a finished tree, by what the pictures say of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import QualityOptions, RunOptions
+from gcar_deploy.errors import GeometryError, RefusedError
+from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.consistency import match_rate
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.measure.lumen import foreshortening
+from gcar_deploy.predict import Evidence
+from gcar_deploy.quality import alternatives
+from gcar_deploy.quality.gates import best_separation, disagreement_limits
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes import footprint, tubes_of
+from gcar_deploy.types import Array, Mask, Scalars
+
+OK, DEGRADED, REFUSED = "ok", "degraded", "refused"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ViewQuality:
+    """How well the reprojected tree and one picture agree.
+
+    Attributes
+    ----------
+    view_id : str
+    name : str, clinical words, for instance ``'RAO 30 CAU 20'``
+    coverage : share of the picture's skeleton near the reprojected centreline
+    support : share of the reprojected centreline (inside the picture) near the vessel mask; not
+        its skeleton, which runs between two vessels that lie side by side
+    distance_mm : mean distance of the skeleton from the centreline, at the isocentre
+    overlap : Dice coefficient of vessel mask and reprojected lumen
+    coverage_2px : as ``coverage``, but within 2 pixels of the picture, whatever their size
+    match_rate : share of the skeleton with a possible partner in the view that sees best across
+    foreshortening : share of the tree's length that this view loses by looking along it
+
+    Undefined figures are None (no skeleton, or no tree in the picture).
+    """
+
+    view_id: str
+    name: str
+    coverage: float | None
+    support: float | None
+    distance_mm: float | None
+    overlap: float | None
+    coverage_2px: float | None = None
+    match_rate: float | None = None
+    foreshortening: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Quality:
+    """Status with a sentence, and what led to it.
+
+    Attributes
+    ----------
+    status : ``ok`` or ``degraded`` (``refused`` and ``failed`` are raised as errors)
+    sentence : str
+    findings : every reason for ``degraded``
+    separation_deg : best angle between two views, folded to 0 .. 90
+    disagreement : worst epipolar disagreement of any view with the first, or None
+    views : one ViewQuality per view
+    exchanges : vessels that the pictures would let change partners
+    """
+
+    status: str
+    sentence: str
+    findings: tuple[str, ...]
+    separation_deg: float
+    disagreement: float | None
+    views: tuple[ViewQuality, ...]
+    exchanges: tuple[alternatives.Exchange, ...] = ()
+
+
+def judge(
+    tree: Tree,
+    views: Sequence[VesselImage],
+    findings: Sequence[str],
+    options: RunOptions,
+    *,
+    disagreement: float,
+    evidence: Evidence | None,
+) -> Quality:
+    """Say of a finished tree what it leaves open, and judge it against the pictures.
+
+    Parameters
+    ----------
+    tree : Tree
+    views : the pictures that it was made from, with the geometry that it was made with
+    findings : earlier reasons for ``degraded``
+    options : RunOptions
+    disagreement : worst epipolar disagreement, 0 .. 1
+    evidence : what the predictor of all views said, or None
+
+    Raises
+    ------
+    RefusedError
+        As ``assess``.
+    """
+    open_ = alternatives.exchanges(tree, [view.carm for view in views])
+    elsewhere = None if evidence is None else alternatives.evidence_elsewhere(
+        tree, evidence.points, evidence.ray, evidence.weight
+    )  # fmt: skip
+    findings = [*findings, *alternatives.findings(open_, elsewhere)]
+    least = options.imaging.path_threshold_pixels
+    lumen = [_lumen(tree, v.carm, least * v.carm.pixel_at_isocenter_mm) for v in views]
+    judged = assess(tree, views, lumen, findings, disagreement, options.quality)
+    return dataclasses.replace(judged, exchanges=open_)
+
+
+def _lumen(tree: Tree, carm: CArm, least_mm: float) -> Mask:
+    """(rows, cols) bool: where the rays cross more than ``least_mm`` of the tree."""
+    inside: Mask = footprint(tubes_of(tree), carm, 1.0).image((carm.rows, carm.columns)) > least_mm
+    return inside
+
+
+def assess(
+    tree: Tree,
+    views: Sequence[VesselImage],
+    lumen: Sequence[Mask],
+    findings: Sequence[str],
+    disagreement: float | None,
+    options: QualityOptions,
+) -> Quality:
+    """Judge the finished tree against the pictures.
+
+    Parameters
+    ----------
+    tree : Tree
+    views : the pictures that it was made from, with the geometry that it was made with
+    lumen : per view (rows, cols) bool, where the reprojected lumen falls
+    findings : earlier reasons for ``degraded``
+    disagreement : worst epipolar disagreement, None if it was not measured
+
+    Raises
+    ------
+    RefusedError
+        Hardly anything of a view is explained, or hardly anything of the tree is seen.
+    """
+    judged = [
+        view_quality(tree, view, inside, options, _across(view, views))
+        for view, inside in zip(views, lumen, strict=True)
+    ]
+    calibrated = all(view.calibrated for view in views)
+    findings = [*findings, *check_explained(judged, disagreement, calibrated, options)]
+    return Quality(
+        status=DEGRADED if findings else OK,
+        sentence=_sentence(findings, len(views)),
+        findings=tuple(findings),
+        separation_deg=best_separation([view.carm for view in views]),
+        disagreement=disagreement,
+        views=tuple(judged),
+    )
+
+
+def check_explained(
+    views: Sequence[ViewQuality],
+    disagreement: float | None,
+    calibrated: bool,
+    options: QualityOptions,
+) -> list[str]:
+    """Judge how much of the pictures a tree explains, and how much of it they show.
+
+    Parameters
+    ----------
+    views : what the comparison of each picture with the tree gave
+    disagreement : worst epipolar disagreement, None if it was not measured
+    calibrated : whether all pictures are
+
+    Raises
+    ------
+    RefusedError
+        As for ``assess``.
+    """
+    findings = []
+    doubtful = (disagreement or 0.0) > disagreement_limits(calibrated, options)[0]
+    for one in views:
+        if doubtful and (one.coverage or 0.0) < options.good_coverage:
+            raise RefusedError(
+                f"the views contradict each other: {disagreement:.0%} of the vessels differ along "
+                f"the epipolar lines, and no tree explains more than {one.coverage or 0.0:.0%} of "
+                f"view {one.view_id}; different patients, frames or angles?"
+            )
+        for value, least, good, what in (
+            (one.coverage, options.min_coverage, options.good_coverage,
+             "of the picture's vessels are explained by the tree"),
+            (one.support, options.min_support, options.good_support,
+             "of the tree lies on the picture's vessels"),
+        ):  # fmt: skip
+            share = 0.0 if value is None else value
+            if share < least:
+                raise RefusedError(f"view {one.view_id}: only {share:.0%} {what}")
+            if share < good:
+                findings.append(f"view {one.view_id}: only {share:.0%} {what}")
+    return findings
+
+
+def _sentence(findings: Sequence[str], count: int) -> str:
+    if not findings:
+        return f"All {count} views are explained by one tree."
+    more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
+    text = findings[0][0].upper() + findings[0][1:] + more
+    return text if text.endswith("?") else f"{text}."
+
+
+def _across(view: VesselImage, views: Sequence[VesselImage]) -> VesselImage | None:
+    """Return the other view whose direction is nearest to 90 deg from this one's."""
+    others = [other for other in views if other is not view]
+    return min(others, key=lambda v: abs(separation_deg(view.carm, v.carm) - 90.0), default=None)
+
+
+def view_quality(
+    tree: Tree,
+    view: VesselImage,
+    lumen: Mask,
+    options: QualityOptions,
+    partner: VesselImage | None = None,
+) -> ViewQuality:
+    """Compare one picture with the reprojected tree; see ``ViewQuality``."""
+    pixel_mm = view.carm.pixel_at_isocenter_mm
+    near_px = _near_px(view.carm, options)
+    line = centreline_mask(tree, view.carm)
+    seen = view.skeleton & view.valid
+    coverage = support = distance = strict = None
+    if seen.any() and line.any():
+        gap = _distance_to(line)[seen]
+        coverage = float((gap <= near_px).mean())
+        distance = float(gap.mean() * pixel_mm)
+        strict = float((gap <= 2.0).mean())
+        visible = line & view.valid
+        if visible.any():
+            support = float((_distance_to(view.mask)[visible] <= near_px).mean())
+    total = int(lumen.sum()) + int(view.mask.sum())
+    return ViewQuality(
+        view_id=view.view_id,
+        name=view.carm.clinical_name(),
+        coverage=coverage,
+        support=support,
+        distance_mm=distance,
+        overlap=2.0 * int((lumen & view.mask).sum()) / total if total else None,
+        coverage_2px=strict,
+        match_rate=None if partner is None else _match_rate(view, partner),
+        foreshortening=_hidden(tree, view.carm),
+    )
+
+
+def _hidden(tree: Tree, carm: CArm) -> float | None:
+    """Share of the whole tree's length that a view hides; None without a tree."""
+    total = tree.length_mm
+    if not total > 0:
+        return None
+    return sum(foreshortening(b, carm) * b.length_mm for b in tree.branches) / total
+
+
+def _match_rate(view: VesselImage, partner: VesselImage) -> float | None:
+    a, b = (np.argwhere(v.skeleton & v.valid)[:, ::-1].astype(np.float64) for v in (view, partner))
+    near_mm = 2.0 * max(view.carm.pixel_at_isocenter_mm, partner.carm.pixel_at_isocenter_mm)
+    try:
+        return match_rate(view.carm, partner.carm, a, b, near_mm)
+    except GeometryError:  # exactly opposite: no epipolar planes
+        return None
+
+
+def unexplained(tree: Tree, view: VesselImage, options: QualityOptions) -> Mask:
+    """(rows, cols) bool: pixels of the picture's skeleton that lower its ``coverage``."""
+    seen: Mask = view.skeleton & view.valid
+    line = centreline_mask(tree, view.carm)
+    return seen & (_distance_to(line) > _near_px(view.carm, options)) if line.any() else seen
+
+
+def _near_px(carm: CArm, options: QualityOptions) -> float:
+    return max(options.near_px, options.near_mm / carm.pixel_at_isocenter_mm)
+
+
+def centreline_mask(tree: Tree, carm: CArm) -> Mask:
+    """(rows, cols) bool: pixels that the reprojected centreline passes through."""
+    canvas = np.zeros((carm.rows, carm.columns), np.uint8)
+    for branch in tree.branches:
+        pixels, depth = carm.project(branch.points_mm)
+        pixels = np.clip(pixels[depth > 1.0], -8192, 8192)
+        if len(pixels) > 1:
+            cv2.polylines(canvas, [np.rint(pixels * 16).astype(np.int32)], False, 1, 1, 8, 4)
+    out: Mask = canvas.astype(bool)
+    return out
+
+
+def _distance_to(mask: Mask) -> Array | Scalars:
+    """(rows, cols) distance to the nearest true pixel, pixels."""
+    distance: Array = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)
+    return distance
