@@ -11,12 +11,13 @@ from gcar_deploy.config import PredictOptions, RunOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.epipolar import triangulate
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes.model import footprint, tubes_of
 from tests.tree.shapes import branch
+from tests.tubes.oracle import path_lengths
 
 SIDE = 128
 EDGE_MM = 80.0
@@ -24,7 +25,6 @@ GRID = Grid(center_mm=(0, 0, 0), size_mm=(EDGE_MM,) * 3, shape=(80,) * 3)
 PATH = Intensity(kind="path_length", polarity="bright", mm_per_count=0.001)
 DONE = {"ok", "degraded"}
 NOT_OK = {"degraded", "refused"}
-ANY = DONE | {"refused"}
 
 
 def straight(axis=(0.2, 0.4, 1.0), length=60.0, radius=1.4, middle=(0.0, 0.0, 0.0)):
@@ -95,7 +95,7 @@ PAIR = (carm(-30, -20), carm(45, 25))
 
 def path_of(tree, view):
     """(rows, cols) path length of the phantom, mm."""
-    return footprint(tubes_of(tree), view, 1.0).image((view.rows, view.columns))
+    return path_lengths(tree, view)
 
 
 def angiogram(view, pixels, name, intensity=PATH, bits=16):
@@ -114,6 +114,19 @@ def paths(tree, views=PAIR):
 def told(pictures, views):
     """Return the same pictures with other geometry."""
     return [dataclasses.replace(p, carm=v) for p, v in zip(pictures, views, strict=True)]
+
+
+def described(tree, real, views, pixels=lambda p: p):
+    """Tree that pictures taken by ``real`` show to who takes them for those of ``views``.
+
+    ``pixels`` is what was done to the pictures besides.
+    """
+
+    def seen_at(points):
+        return triangulate(list(views), [pixels(v.project(points)[0]) for v in real])[0]
+
+    branches = tuple(dataclasses.replace(b, points_mm=seen_at(b.points_mm)) for b in tree.branches)
+    return dataclasses.replace(tree, nodes_mm=seen_at(tree.nodes_mm), branches=branches)
 
 
 def changed(pictures, change, only=None):

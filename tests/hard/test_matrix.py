@@ -1,4 +1,4 @@
-"""Every hard case ends in its class, all numbers finite, and no ``ok`` is far beyond its bound."""
+"""Every hard case ends in its class, all numbers finite, and an ``ok`` within its stated sigma."""
 
 from __future__ import annotations
 
@@ -7,17 +7,47 @@ import pytest
 
 from gcar_deploy.engine import Engine
 from tests.hard.cases import FAMILIES
-from tests.hard.phantoms import GRID, distances, engine_without_model, everything_finite, outcome
+from tests.hard.phantoms import (
+    DONE,
+    GRID,
+    NOT_OK,
+    distances,
+    engine_without_model,
+    everything_finite,
+    outcome,
+)
 
-CASES = [
-    pytest.param(*case, *([GRID] if len(case) == 4 else []), id=f"{family}: {case[0]}")
-    for family, make in FAMILIES.items()
-    for case in make()
+ARGUMENTS = ("make", "allowed", "truth", "grid")
+#: cases that end ``ok`` and are wrong: faults of the program, not of the test
+KNOWN_FAULTS = {
+    "5 ghosts: 2 bars 9 mm apart": "a ghost beside the two bars is taken for a third vessel",
+    "7 hardly any vessel: beyond the picture": "ends cut off by the borders mislead the pose",
+    "13 noise: 100 photons": "two branches of a noisy raw pair are exchanged unnoticed",
+}
+
+
+def cases(with_faults):
+    """One parameter set per case; with the shipped predictor, known faults may fail."""
+    out = []
+    for family, make in FAMILIES.items():
+        for name, *case in make():
+            key = f"{family}: {name}"
+            known = with_faults and key in KNOWN_FAULTS
+            marks = [pytest.mark.xfail(reason=KNOWN_FAULTS[key])] if known else []
+            values = case if len(case) == len(ARGUMENTS) else (*case, GRID)
+            out.append(pytest.param(*values, id=key, marks=marks))
+    return out
+
+
+CASES = cases(with_faults=True)
+#: the quick part takes one of each family: the first that has a truth, or the first
+QUICK = [
+    min(
+        (case for case in CASES if str(case.id).startswith(f"{family}: ")),
+        key=lambda case: case.values[2] is None,
+    )
+    for family in FAMILIES
 ]
-#: what the shipped predictor meets as well: families that end in ``ok``, and those that tempt it
-WITH_MODEL = ("2 ", "3 ", "4 ", "5 ", "8 ", "9 ", "12 ", "13 ", "15 ", "23 ")
-#: one variant of each family keeps the quick part honest
-QUICK = [case for k, case in enumerate(CASES) if k % 12 == 0]
 
 
 def check(found, allowed, truth):
@@ -26,17 +56,21 @@ def check(found, allowed, truth):
         return
     assert everything_finite(found.result)
     assert found.result.volume.min() >= 0 and found.result.volume.max() <= 1
-    if found.kind != "ok" or truth is None:
-        return
-    error, sigma = distances(found.result.tree, truth)
-    bound = 1.96 * np.sqrt(np.mean(sigma**2))
-    assert np.sqrt(np.mean(error**2)) <= 3 * bound
+    if found.kind == "ok":
+        error, sigma = distances(found.result.tree, truth)
+        bound = 1.96 * np.sqrt(np.mean(sigma**2))
+        assert np.sqrt(np.mean(error**2)) <= bound
 
 
-def test_there_are_six_variants_of_every_family():
+def test_six_variants_of_every_family_and_each_has_a_class_or_a_truth():
     for family, make in FAMILIES.items():
-        cases = list(make())
-        assert len(cases) == len({case[0] for case in cases}) == 6, family
+        made = list(make())
+        assert len(made) == len({case[0] for case in made}) == 6, family
+        for name, _, allowed, truth, *_ in made:
+            assert ("ok" in allowed) == (truth is not None) or allowed <= NOT_OK, name
+            assert allowed == DONE or allowed <= NOT_OK or allowed == {"error 4"}, name
+    assert {str(case.id) for case in CASES} >= set(KNOWN_FAULTS)
+    assert len(QUICK) == len(FAMILIES) == 19
 
 
 @pytest.fixture(scope="module")
@@ -52,21 +86,19 @@ def shipped():
     return engine
 
 
-@pytest.mark.parametrize(("name", "make", "allowed", "truth", "grid"), QUICK)
-def test_hard_case_of_each_kind(bare, name, make, allowed, truth, grid):
-    check(outcome(make, bare, grid), allowed, truth)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "make", "allowed", "truth", "grid"), CASES)
-def test_hard_case_without_a_model(bare, name, make, allowed, truth, grid):
-    check(outcome(make, bare, grid), allowed, truth)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "make", "allowed", "truth", "grid"),
-    [case for case in CASES if str(case.id).startswith(WITH_MODEL)],
-)
-def test_hard_case_with_the_shipped_predictor(shipped, name, make, allowed, truth, grid):
+@pytest.mark.parametrize(ARGUMENTS, QUICK)
+def test_hard_case_of_each_family(shipped, make, allowed, truth, grid):
     check(outcome(make, shipped, grid), allowed, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(ARGUMENTS, [case for case in CASES if case not in QUICK])
+def test_hard_case(shipped, make, allowed, truth, grid):
+    check(outcome(make, shipped, grid), allowed, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(ARGUMENTS, cases(with_faults=False))
+def test_without_a_model_nothing_is_ok(bare, make, allowed, truth, grid):
+    """Depth from thinning alone is told as such: done means degraded."""
+    check(outcome(make, bare, grid), {"degraded"} if allowed == DONE else allowed, truth)

@@ -4,7 +4,7 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.tubes.model import footprint, tubes_of
+from tests.tubes.oracle import path_lengths
 
 
 def carm(primary, secondary, size=256, spacing=0.5):
@@ -33,13 +33,8 @@ def vessel_image(view, path, calibrated=True, name="1"):
 
 
 def seen(tree, carms, calibrated=True, gain=1.0):
-    """Pictures of a tree by the tube model itself, a box of a pixel wide."""
+    """Pictures of a tree by the oracle, which shares nothing with the tube model."""
     return [
-        vessel_image(
-            view,
-            gain * footprint(tubes_of(tree), view, 1.0).image((view.rows, view.columns)),
-            calibrated,
-            str(k + 1),
-        )
+        vessel_image(view, gain * path_lengths(tree, view), calibrated, str(k + 1))
         for k, view in enumerate(carms)
     ]
