@@ -6,9 +6,14 @@ import os
 import signal
 from pathlib import Path
 
+# Several test processes share the cores: a thread pool in each would only be in the others' way.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(_name, "1")
+
 import pytest
 
-from tests import requirements_plugin
+from tests import part_times, requirements_plugin
 
 
 def data_dir() -> Path:
@@ -25,16 +30,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Requirements are judged where all reports meet: not in a process of pytest-xdist."""
+    """Requirements and times are judged where all reports meet: not in a worker of pytest-xdist."""
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         # A shell's background job ignores Ctrl-C, and so would every process that a test starts.
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(requirements_plugin.RequirementsPlugin(config))
+        config.pluginmanager.register(part_times.PartTimes())
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Let reports name their requirements; skip benchmarks unless they are asked for."""
+    """Quick tests first, reports name requirements, benchmarks only when asked for."""
+    part_times.quick_first(items)
     requirements_plugin.name_requirements(items)
     if config.getoption("--run-benchmarks"):
         return

@@ -49,6 +49,8 @@ def test_writing_fills_the_last_column_alone():
 @pytest.fixture
 def project(pytester, monkeypatch):
     """A small project with the plugin and a table of three requirements."""
+    # Other plugins are not asked, and take a second each to load.
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     table = pytester.path / "requirements.md"
     table.write_text(TABLE_TEXT)
     pytester.makeini("[pytest]\ntestpaths = tests\nmarkers =\n    req(*names): requirements\n")
@@ -72,7 +74,11 @@ def pytest_collection_modifyitems(items):
     return write
 
 
-@pytest.mark.parametrize("workers", [(), ("-n", "2")], ids=["alone", "xdist"])
+@pytest.mark.parametrize(
+    "workers",
+    [(), pytest.param(("-p", "xdist", "-n", "2"), marks=pytest.mark.slow)],
+    ids=["alone", "xdist"],
+)
 def test_a_skipped_requirement_is_told_and_a_missing_one_fails(project, pytester, workers):
     project("pass")
     done = pytester.runpytest_subprocess("-p", "no:cacheprovider", *workers)
