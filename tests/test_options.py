@@ -115,6 +115,7 @@ def test_numbers_of_other_libraries_are_numbers():
     check_options(PredictOptions(looks=np.int64(3), look_again=np.float32(0.5)))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 @given(path=st.sampled_from([p for p in FIELDS if p.startswith(_USED)]), data=st.data())
 def test_odd_values_give_one_line_or_a_result(path, data):

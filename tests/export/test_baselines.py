@@ -50,6 +50,7 @@ def test_visual_hull_contains_the_tree_and_shrinks_with_views(tree):
     assert hulls[1].sum() < 0.7 * hulls[0].sum()
 
 
+@pytest.mark.slow
 def test_rtk_projects_as_the_ray_caster_does(tree):
     pytest.importorskip("itk")
     from gcar_export.methods.rtk_geometry import forward
@@ -74,7 +75,9 @@ def test_volume_passes_through_rtk_unchanged(tree):
     assert np.array_equal(volume_array(volume_image(volume, grid)), volume)
 
 
-@pytest.mark.parametrize(("method", "least"), [("fdk", 0.75), ("sart", 0.85)])
+@pytest.mark.parametrize(
+    ("method", "least"), [("fdk", 0.75), pytest.param("sart", 0.85, marks=pytest.mark.slow)]
+)
 def test_sixteen_views_are_enough(tree, method, least):
     pytest.importorskip("itk")
     import importlib

@@ -182,6 +182,7 @@ def _counting(function, calls):
     return counted
 
 
+@pytest.mark.slow
 def test_changed_settings_are_redone_kept_or_refused_aloud(data, tmp_path, engine, caplog):
     given = {"data": data, "out": tmp_path, "protocol": "paper", "methods": ("visual_hull",)}
     first = evaluate.evaluate(evaluate.EvaluateOptions(**given))

@@ -81,6 +81,7 @@ def test_pairs_are_what_they_are_called(subjects):
     assert again.angiograms[1].sha256 == made["shift"].angiograms[1].sha256
 
 
+@pytest.mark.slow
 def test_raw_pairs_differ_in_what_they_are_made_of(subjects):
     raws = {make_pair(*subjects, kind, "raw", SEED + k).raw for kind in KINDS for k in range(2)}
     assert len(raws) > 5

@@ -104,7 +104,8 @@ def test_scenes_show_labels_about_as_often_as_asked(folder):
     assert picture.known.any()
 
 
-@pytest.mark.parametrize("network", ["single", pytest.param("multi", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("network", ["single", "multi"])
 def test_training_with_labels_remembers_them(tmp_path, folder, network):
     start(tmp_path / "run", network, "tiny", labels=folder)
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())

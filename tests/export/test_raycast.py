@@ -103,7 +103,9 @@ def test_empty_and_unseen_volumes_are_dark():
     assert not raycast(away, carm(0, 0)).any()
 
 
-@pytest.mark.parametrize("case", ["0001", "0401", "0595"])
+@pytest.mark.parametrize(
+    "case", ["0001", *(pytest.param(c, marks=pytest.mark.slow) for c in ("0401", "0595"))]
+)
 @pytest.mark.parametrize("protocol", ["P", "C", "M"])
 def test_pictures_of_the_ready_cases(case, protocol):
     label = read_label(data("imagecas", f"{case}.label.nii.gz"))

@@ -136,6 +136,7 @@ def test_schedule_is_a_function_of_the_step():
     assert [learning_rate(o, k) for k in (0, 9, 79, 90, 100)] == pytest.approx([0.1, 1, 1, 0.5, 0])
 
 
+@pytest.mark.slow
 def test_training_resumes_to_the_bit(tmp_path):
     options = PRESETS["tiny"]
     train(tmp_path / "whole", options, CONFIGS["tiny"])
@@ -158,6 +159,7 @@ def test_training_resumes_to_the_bit(tmp_path):
     assert [r["step"] for r in read_log(tmp_path / "whole/log.csv")] == ["2", "4"]
 
 
+@pytest.mark.slow
 def test_a_step_in_bfloat16_stays_near_one_in_float32(tmp_path):
     """The code path of the gpu preset, as far as a CPU goes."""
     one = dataclasses.replace(PRESETS["tiny"], steps=1, decay_steps=1)

@@ -195,6 +195,7 @@ def test_area_average_by_a_whole_factor_is_the_block_mean():
     np.testing.assert_allclose(area_average(picture, 8, 12), blocks, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_real_and_simulated_pictures():
     from gcar_export.studies import segmentation_table as table
 

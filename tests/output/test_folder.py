@@ -144,7 +144,10 @@ def test_a_folder_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)],
+)
 @pytest.mark.req("REQ-24")
 def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
     out = tmp_path / "out"

@@ -39,7 +39,7 @@ def worst_visible_mm(poses, moved):
     )
 
 
-@pytest.mark.parametrize("seed", [4, 6, 8])
+@pytest.mark.parametrize("seed", [4, *(pytest.param(s, marks=pytest.mark.slow) for s in (6, 8))])
 @pytest.mark.parametrize("count", [3, 4])
 def test_known_shifts_are_found_where_pairs_alone_miss_them(count, seed, monkeypatch):
     moved = moves(count, seed)
