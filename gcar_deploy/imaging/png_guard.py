@@ -18,6 +18,9 @@ TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*")
 MAX_CHUNK_BYTES = 16 * 2**20
 _ANIMATION = {b"acTL", b"fcTL", b"fdAT"}
 _CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
+#: TIFF sample formats, and what is read of them
+_UNSIGNED, _FLOATING = 1, 3
+_TIFF_KINDS = "8 or 16 bit grey, or 32 bit floating-point grey, is needed"
 _MAX_TIFF_ENTRIES = 256
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 
@@ -124,8 +127,8 @@ def check_tiff(data: bytes, smallest: int, largest: int) -> int:
     Raises
     ------
     ValueError
-        Truncated, several pages, turned by an orientation tag, not 8 or 16 bit unsigned, a
-        palette or inverted grey, sides out of range.
+        Truncated, several pages, turned by an orientation tag, neither 8 or 16 bit unsigned nor
+        32 bit floating-point grey, a palette or inverted grey, sides out of range.
     """
     order = "<" if data[:2] == b"II" else ">"
     tags, next_page = _tiff_directory(data, order)
@@ -133,16 +136,16 @@ def check_tiff(data: bytes, smallest: int, largest: int) -> int:
         raise ValueError("holds several pages; export the one frame to be used")
     rows, columns = _one(tags, 257, 0), _one(tags, 256, 0)
     check_sides(rows, columns, smallest, largest)
-    depths = set(tags.get(258, (1,)))
-    if len(depths) != 1 or not depths <= {8, 16}:
-        raise ValueError(f"has {sorted(depths)} bits per sample; 8 or 16 bit grey is needed")
-    if set(tags.get(339, (1,))) != {1}:
-        raise ValueError("holds signed or floating-point samples; save such data as NPY")
+    depths, formats = set(tags.get(258, (1,))), set(tags.get(339, (_UNSIGNED,)))
+    if len(depths) != 1 or not depths <= {8, 16, 32}:
+        raise ValueError(f"has {sorted(depths)} bits per sample; {_TIFF_KINDS}")
+    if formats != {_FLOATING if 32 in depths else _UNSIGNED}:
+        raise ValueError(f"holds signed samples or floating-point numbers of 16 bit; {_TIFF_KINDS}")
     if _one(tags, 262, -1) not in (1, 2):
         raise ValueError("is not plain grey (black is zero); export it as 8 or 16 bit grey")
     if _one(tags, 274, 1) != 1:
         raise ValueError("asks to be turned (orientation tag); export it the right way up")
-    if not 1 <= _one(tags, 277, 1) <= 4:
+    if not 1 <= _one(tags, 277, 1) <= (1 if 32 in depths else 4):
         raise ValueError("has an invalid number of channels; export it as 8 or 16 bit grey")
     _check_tiff_data(data, tags, rows * columns)
     return depths.pop()

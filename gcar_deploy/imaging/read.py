@@ -19,9 +19,11 @@ from gcar_deploy.types import Array, Image
 
 _log = logging.getLogger(__name__)
 _NPY_SIGNATURE = b"\x93NUMPY"
+_JPEG_SIGNATURE = b"\xff\xd8\xff"
 #: what else a hostile header can raise
 _HEADER = (MemoryError, RecursionError, OverflowError)
 _NPY_DEPTH = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
+_TYPE_OF = {8: np.uint8, 16: np.uint16, 32: np.float32}
 _SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
 
 
@@ -32,7 +34,8 @@ def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple
     ----------
     path : str or Path
         ``.png``, ``.tif``/``.tiff`` (8 or 16 bit grey, or colour with R = G = B and no
-        transparency) or ``.npy`` (2-D uint8, uint16, or finite non-negative float32/64).
+        transparency; TIFF also non-negative float32) or ``.npy`` (2-D uint8, uint16, or finite
+        non-negative float32/64).
     limits : PictureLimits, optional
 
     Returns
@@ -60,8 +63,12 @@ def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple
 
 def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Image, int]:
     expected = _SUFFIXES.get(suffix)
+    if data.startswith(_JPEG_SIGNATURE):
+        raise ValueError(
+            "is a JPEG picture: its compression loses thin vessels; export PNG, TIFF, NPY or DICOM"
+        )
     if expected is None:
-        raise ValueError("has an unknown kind of name; use .png, .tif, .tiff or .npy")
+        raise ValueError("has an unknown kind of name; use .png, .tif, .tiff, .npy or DICOM")
     found = _sniff(data)
     if found != expected:
         what = f"is a {found} file" if found else f"is not a {expected} file"
@@ -75,10 +82,11 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Image, int
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         picture = None
-    if picture is None or picture.dtype != {8: np.uint8, 16: np.uint16}[depth]:
+    if picture is None or picture.dtype != _TYPE_OF[depth]:
         raise ValueError("cannot be decoded (damaged or unusual); export it again as 8/16 bit grey")
     grey = _one_channel(picture)
     png_guard.check_sides(grey.shape[0], grey.shape[1], limits.min_side, limits.max_side)
+    _check_counts(grey)
     return grey.astype(np.float32), depth
 
 
@@ -125,8 +133,15 @@ def _decode_npy(data: bytes, limits: PictureLimits) -> tuple[Image, int]:
         raise ValueError("is truncated or has bytes to spare; save it again with numpy.save")
     array = np.frombuffer(data, dtype, offset=stream.tell())
     array = array.reshape(shape, order="F" if fortran else "C")
-    if dtype.kind == "f" and not (np.isfinite(array).all() and array.min() >= 0):
-        raise ValueError("holds negative or non-finite values; grey values must be >= 0 and finite")
-    if dtype.kind == "f" and array.max() > np.finfo(np.float32).max:
-        raise ValueError("holds values too large for single precision; rescale it")
+    _check_counts(array)
     return np.ascontiguousarray(array, dtype=np.float32), _NPY_DEPTH[dtype.newbyteorder("=").name]
+
+
+def _check_counts(array: Array) -> None:
+    """Refuse floating-point numbers that are no grey values."""
+    if array.dtype.kind != "f":
+        return
+    if not (np.isfinite(array).all() and array.min() >= 0):
+        raise ValueError("holds negative or non-finite values; grey values must be >= 0 and finite")
+    if array.max() > np.finfo(np.float32).max:
+        raise ValueError("holds values too large for single precision; rescale it")

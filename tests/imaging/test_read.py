@@ -52,6 +52,17 @@ def test_floating_npy(tmp_path, picture, fortran):
     np.testing.assert_allclose(pixels, picture, rtol=1e-6, atol=1e-37)
 
 
+@_quick
+@given(hnp.arrays(np.float32, _shapes, elements=st.floats(0, 1e6, width=32)), st.booleans())
+def test_floating_tiff_is_read_like_npy(tmp_path, picture, packed):
+    how = [cv2.IMWRITE_TIFF_COMPRESSION, 5 if packed else 1]  # LZW, none
+    (tmp_path / "p.tif").write_bytes(cv2.imencode(".tif", picture, how)[1].tobytes())
+    np.save(tmp_path / "p.npy", picture)
+    tiff, npy = (read_picture(tmp_path / name) for name in ("p.tif", "p.npy"))
+    np.testing.assert_array_equal(tiff[0], npy[0])
+    assert tiff[1] == npy[1] == 32
+
+
 def test_grey_stored_as_colour_is_grey(tmp_path):
     grey = np.arange(400, dtype=np.uint16).reshape(20, 20)
     colour = np.stack([grey] * 3, -1)
@@ -112,8 +123,8 @@ _BAD = {
     "text.png": (b"hello", "is not a PNG file"),
     "tiff.png": (_encoded(".tiff", _GREY), "is a TIFF file though"),
     "png.tif": (png(), "is a PNG file though"),
-    "jpeg.png": (_encoded(".jpg", _GREY), "is not a PNG file"),
-    "name.jpg": (_encoded(".jpg", _GREY), "unknown kind of name"),
+    "jpeg.png": (_encoded(".jpg", _GREY), "JPEG picture: its compression loses"),
+    "name.jpg": (_encoded(".jpg", _GREY), "export PNG, TIFF, NPY or DICOM"),
     "noname": (png(), "unknown kind of name"),
     "half.png": (_encoded(".png", _GREY)[:120], "truncated"),
     "signature.png": (png()[:8], "truncated"),
@@ -137,8 +148,13 @@ _BAD = {
     "pages.tif": (_tiff(next_page=8), "several pages"),
     "turned.tif": (_tiff(t274=6), "orientation"),
     "inverted.tif": (_tiff(t262=0), "plain grey"),
-    "deep.tif": (_tiff(t258=32), "bits per sample"),
+    "deep.tif": (_tiff(t258=64), "bits per sample"),
+    "long.tif": (_tiff(t258=32), "signed samples"),
     "float.tif": (_tiff(t339=3), "floating-point"),
+    "floats.tif": (_tiff(t258=32, t339=3, t277=3), "channels"),
+    "nan.tif": (_encoded(".tiff", np.full((16, 16), np.nan, np.float32)), "non-finite"),
+    "minus.tif": (_encoded(".tiff", np.full((16, 16), -1, np.float32)), "negative"),
+    "double.tif": (_encoded(".tiff", np.ones((16, 16))), "bits per sample"),
     "big.tif": (_tiff(t256=100000), "each side must be"),
     "cut.tif": (_tiff()[:300], "truncated"),
     "head.tif": (b"II*\0\x08", "truncated or damaged"),
