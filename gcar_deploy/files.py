@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import stat
 from pathlib import Path
@@ -52,6 +53,26 @@ def read_bounded(path: str | Path, max_bytes: int) -> bytes:
     if not data:
         raise ValueError("is empty; copy or export it again")
     return data
+
+
+def read_text(path: str | Path, max_bytes: int) -> str:
+    """Return the text of a file; see ``read_bounded`` and ``text_of``."""
+    return text_of(read_bounded(path, max_bytes))
+
+
+def text_of(data: bytes) -> str:
+    """Decode UTF-8, or UTF-16 behind its mark, as editors and shells of Windows write it.
+
+    Raises
+    ------
+    ValueError
+        The end of a sentence that the caller begins with the file's name.
+    """
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        return data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError(f"is not {'UTF-16' if wide else 'UTF-8'} text") from None
 
 
 def _size(count: int) -> str:

@@ -1,7 +1,8 @@
 """The scene file ``geom.json`` (schema gcar-geometry/1) to views and back.
 
-Parsing is strict: 64 KiB of UTF-8, no NaN or Infinity, no duplicate or unknown keys, no booleans
-for numbers. Every refusal is one line that names the file, the view, the key and the value.
+Parsing is strict: 64 KiB of UTF-8 (or UTF-16 behind its byte order mark), no NaN or Infinity, no
+duplicate or unknown keys, no booleans for numbers. Every refusal is one line that names the file,
+the view, the key and the value.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import GeometryError
-from gcar_deploy.files import read_bounded
+from gcar_deploy.files import read_text
 from gcar_deploy.geometry.carm import CLINICAL_RANGES, CArm
 from gcar_deploy.geometry.fields import (
     MAX_BYTES,
@@ -134,9 +135,7 @@ def load_scene(path: str | Path) -> Scene:
     """
     path = Path(path)
     try:
-        text = read_bounded(path, MAX_BYTES).decode("utf-8")
-    except UnicodeDecodeError:
-        raise GeometryError(f"{path.name} is not UTF-8 text") from None
+        text = read_text(path, MAX_BYTES)
     except ValueError as error:
         raise GeometryError(f"{path.name} cannot be read: {error}") from None
     return parse_scene(text, path.name)
