@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gcar_deploy.geometry.carm import CArm
     from gcar_deploy.geometry.grid import Grid
     from gcar_deploy.geometry.scene import Scene, load_scene
-    from gcar_deploy.output.result import Result
+    from gcar_deploy.result import Result
 
 __all__ = ["CArm", "Engine", "GcarError", "Grid", "Result", "RunOptions", "Scene", "load_scene"]
 
@@ -28,7 +28,7 @@ _HOMES = {
     "Engine": "gcar_deploy.engine",
     "GcarError": "gcar_deploy.errors",
     "Grid": "gcar_deploy.geometry.grid",
-    "Result": "gcar_deploy.output.result",
+    "Result": "gcar_deploy.result",
     "RunOptions": "gcar_deploy.config",
     "Scene": "gcar_deploy.geometry.scene",
     "load_scene": "gcar_deploy.geometry.scene",

@@ -25,9 +25,9 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half, asks_network
 from gcar_deploy.imaging.net import Segmenter, check_segmenter, load_segmenter
 from gcar_deploy.imaging.read import read_picture
-from gcar_deploy.output.result import Result
 from gcar_deploy.predict import load_predictor, missing_predictor
 from gcar_deploy.reconstruct import reconstruct
+from gcar_deploy.result import Result
 from gcar_deploy.stopwatch import OnProgress
 
 #: a file, an array of counts, or a picture that already knows its C-arm
@@ -141,7 +141,7 @@ class Engine:
         angiograms, grid, notes = prepare(views, geometry, self.options)
         angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
         notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
-        result = reconstruct(
+        found = reconstruct(
             angiograms,
             grid,
             self.options,
@@ -152,7 +152,7 @@ class Engine:
             cancel=cancel,
             used_s=time.perf_counter() - started,
         )
-        return dataclasses.replace(result, notes=(*notes, *self._notes, *result.notes))
+        return Result.of(found, (*notes, *self._notes, *found.notes))
 
 
 def prepare(

@@ -16,10 +16,10 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.vessels import find_vessels
 from gcar_deploy.measure.inlet import from_inlets
-from gcar_deploy.output.result import Result
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import check_candidates, check_tree, check_views, judge
+from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes import refine, refined_volume
@@ -42,7 +42,7 @@ def reconstruct(
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
     used_s: float = 0.0,
-) -> Result:
+) -> Reconstruction:
     """Reconstruct the coronary tree that all views show.
 
     Parameters
@@ -102,7 +102,7 @@ def reconstruct(
             disagreement=placed.disagreement, evidence=centers.evidence,
         )  # fmt: skip
         tree = from_inlets(refined.tree)
-    return Result(
+    return Reconstruction(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=placed.views, poses=placed.poses,
         seconds={**watch.seconds, "total": watch.elapsed_s},

@@ -26,8 +26,9 @@ FLOORS = {
             "predict tubes measure",
             "quality",
             "pose",
-            "output selftest data",
-            "reconstruct",
+            "reconstruction",
+            "output reconstruct selftest data",
+            "result",
             "engine",
             "inspection worker batch bench",
             "cli",
@@ -128,6 +129,14 @@ def test_files_stay_small_and_quiet(path):
         if isinstance(node, ast.ExceptHandler):
             assert node.type is not None, f"bare except in line {node.lineno}"
         assert not isinstance(node, ast.Assert), f"assert in line {node.lineno}"
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "output").glob("*.py")), ids=name_of)
+def test_writers_measure_nothing(path):
+    """What is measured comes to them as ``Measured``, worked out once below."""
+    below = ("gcar_deploy.measure", "gcar_deploy.pose", "gcar_deploy.geometry.observability")
+    found = {module for module in imports(path) if module.startswith(below)}
+    assert found <= {"gcar_deploy.measure.measured", "gcar_deploy.measure.measured.Measured"}
 
 
 def loaded_by(code: str) -> set[str]:

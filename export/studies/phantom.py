@@ -29,8 +29,8 @@ from gcar_deploy.geometry.epipolar import ray_gaps
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.output.result import Result
 from gcar_deploy.quality.status import centreline_mask
+from gcar_deploy.result import Result
 from gcar_deploy.tree.surface import lumen_surface
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Mask, Points

@@ -25,7 +25,7 @@ from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.output.result import Result
+from gcar_deploy.result import Result
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import PIXEL_SHARE

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.batch.work import COLUMNS
-from gcar_deploy.output.result import RESEARCH_USE
+from gcar_deploy.reconstruction import RESEARCH_USE
 
 _STYLE = """
 body { margin: 0 auto; max-width: 1280px; padding: 16px; color: #1c2430; background: #f5f7fa;

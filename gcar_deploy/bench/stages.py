@@ -28,13 +28,13 @@ _CHILD = """
 import json, sys, time
 t = [time.perf_counter()]
 from gcar_deploy.engine import Engine
-from gcar_deploy.output import bundle
+import gcar_deploy.output.bundle
 t.append(time.perf_counter())
 engine = Engine(threads=int(sys.argv[4]) or None)
 t.append(time.perf_counter())
 result = engine.reconstruct(sys.argv[1:3], sys.argv[3])
 t.append(time.perf_counter())
-bundle.write_result(result, __import__("pathlib").Path(sys.argv[5]))
+result.save(sys.argv[5])
 t.append(time.perf_counter())
 own = {"imports": t[1] - t[0], "model": t[2] - t[1], "files": t[4] - t[3]}
 json.dump({**own, **result.seconds}, sys.stdout)

@@ -48,7 +48,7 @@ def examine() -> dict[str, Any]:
     """Collect the report; plain values only."""
     import cv2
 
-    from gcar_deploy.output.result import versions
+    from gcar_deploy.reconstruction import versions
 
     return {
         "versions": versions(),

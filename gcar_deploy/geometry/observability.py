@@ -76,12 +76,11 @@ def curve_sigmas(
 ) -> Scalars:
     """Worst standard deviation across a vessel, where along it nothing is measured.
 
-    A view measures only the component m = unit(d x T) of a displacement; sliding along the
-    vessel leaves the picture as it is.
-
     Parameters
     ----------
+    carms : views
     points_mm, tangents : (n, 3) mm LPS, unit vectors
+    sigma_px : float, noise in every view, pixels
 
     Returns
     -------
@@ -89,22 +88,38 @@ def curve_sigmas(
     """
     information = np.zeros((len(points_mm), 3, 3))
     for carm in carms:
-        rays = points_mm - carm.source_mm
-        depth = np.linalg.norm(rays, axis=1)
-        across = np.cross(rays / depth[:, None], tangents)
-        sine = np.linalg.norm(across, axis=1)
-        seen = sine > math.sin(math.radians(ALONG_BEAM_DEG))
-        m = across / np.maximum(sine, 1e-12)[:, None]
-        mm_per_px = depth / math.sqrt(math.prod(carm.focal_px))
-        weight = seen / (sigma_px * mm_per_px) ** 2
-        information += weight[:, None, None] * m[:, :, None] * m[:, None, :]
+        information += curve_information(carm, points_mm, tangents)
+    return sigma_px * worst_across(information)
+
+
+def curve_information(carm: CArm, points_mm: Points, tangents: Points) -> Array:
+    """(n, 3, 3) Fisher information of one view about points of a vessel for 1 px of noise, mm^-2.
+
+    A view measures only the component m = unit(d x T) of a displacement; sliding along the
+    vessel leaves the picture as it is.
+    """
+    rays = points_mm - carm.source_mm
+    depth = np.linalg.norm(rays, axis=1)
+    across = np.cross(rays / depth[:, None], tangents)
+    sine = np.linalg.norm(across, axis=1)
+    seen = sine > math.sin(math.radians(ALONG_BEAM_DEG))
+    m = across / np.maximum(sine, 1e-12)[:, None]
+    mm_per_px = depth / math.sqrt(math.prod(carm.focal_px))
+    weight = seen / mm_per_px**2
+    out: Array = weight[:, None, None] * m[:, :, None] * m[:, None, :]
+    return out
+
+
+def worst_across(information: Array) -> Scalars:
+    """(n,) standard deviation in the worse direction across a vessel, mm; see ``curve_sigmas``."""
     # Only the plane across the vessel counts: along T the information is nil by construction.
     values = np.linalg.eigvalsh(information)
     low, high = values[:, 1], values[:, 2]
     with np.errstate(divide="ignore"):
-        return np.where(
+        out: Scalars = np.where(
             low > RELATIVE_CUTOFF * high, 1.0 / np.sqrt(np.maximum(low, 1e-300)), np.inf
         )
+    return out
 
 
 def classes(sigma_mm: Scalars, noise_mm: float) -> Array:

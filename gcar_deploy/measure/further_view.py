@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.observability import curve_sigmas
+from gcar_deploy.geometry.observability import curve_information, worst_across
 from gcar_deploy.measure.lumen import foreshortening
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Array
 
 #: directions that are looked at, degrees; not both angles large at once: within the ellipse
 PRIMARY_DEG = tuple(range(-60, 61, 10))
@@ -47,7 +48,8 @@ class FurtherView:
 def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
     """Search the directions a C-arm reaches, in steps of 10 degrees.
 
-    The measure is the mean Cramer-Rao bound across the vessel (``curve_sigmas``), which counts
+    The measure is the mean Cramer-Rao bound across the vessel
+    (``observability.curve_sigmas``), which counts
     what is foreshortened by itself; None for a tree without a branch.
     """
     if not tree.branches:
@@ -58,8 +60,10 @@ def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
     points, tangents = points[keep], tangents[keep]
     model = carms[0]
 
-    def mean_sigma(views: Sequence[CArm]) -> float:
-        return float(np.minimum(curve_sigmas(views, points, tangents), WORST_MM).mean())
+    known = sum(curve_information(carm, points, tangents) for carm in carms)
+
+    def mean_sigma(information: Array) -> float:
+        return float(np.minimum(worst_across(information), WORST_MM).mean())
 
     best, least = None, np.inf
     for primary, secondary in itertools.product(PRIMARY_DEG, SECONDARY_DEG):
@@ -74,7 +78,7 @@ def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
             columns=model.columns,
             pixel_spacing_mm=model.pixel_spacing_mm,
         )
-        sigma = mean_sigma([*carms, carm])
+        sigma = mean_sigma(known + curve_information(carm, points, tangents))
         if sigma < least:
             best, least = carm, sigma
     if best is None:
@@ -85,7 +89,7 @@ def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
         primary_angle_deg=best.primary_angle_deg,
         secondary_angle_deg=best.secondary_angle_deg,
         name=best.clinical_name(),
-        sigma_before_mm=mean_sigma(carms),
+        sigma_before_mm=mean_sigma(np.asarray(known)),
         sigma_after_mm=least,
         foreshortening=float(np.average(hidden, weights=np.maximum(lengths, 1e-9))),
     )

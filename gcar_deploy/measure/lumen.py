@@ -23,21 +23,21 @@ MIN_POINTS = 5
 ANGLE_REACH_MM = 4.0
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class BranchLumen:
     """One branch in figures; None where the branch is too short to say.
 
     Attributes
     ----------
-    branch : int
+    healthy_mm : (m,) reference diameter at each point; NaN near the ends and in short branches
     length_mm, mean_diameter_mm : float
-    minimal_diameter_mm, minimal_at_mm : minimal lumen diameter and where along the branch
+    minimal_diameter_mm, minimal_at_mm : minimal lumen diameter and how far from the inlet
     reference_diameter_mm : healthy diameter there, by a line through the wider parts
     stenosis_percent : 100 (1 - minimal / reference), 0 or more
     lesion_length_mm : stretch round the minimum narrower than the reference by a quarter
     """
 
-    branch: int
+    healthy_mm: Scalars
     length_mm: float
     mean_diameter_mm: float
     minimal_diameter_mm: float | None = None
@@ -57,20 +57,17 @@ class BifurcationAngle:
     angle_deg: float
 
 
-def branch_lumens(tree: Tree) -> tuple[BranchLumen, ...]:
-    """Measure every branch."""
-    return tuple(branch_lumen(branch, k) for k, branch in enumerate(tree.branches))
-
-
-def branch_lumen(branch: Branch, number: int = 0) -> BranchLumen:
+def branch_lumen(branch: Branch) -> BranchLumen:
     """Measure one branch; see ``BranchLumen``."""
     arc, diameter = diameter_curve(branch)
     weight = np.gradient(arc) if len(arc) > 1 else np.ones(len(arc))
     mean = float(np.average(diameter, weights=np.maximum(weight, 1e-9)))
-    short = BranchLumen(branch=number, length_mm=float(arc[-1]), mean_diameter_mm=mean)
+    healthy = np.full(len(arc), np.nan)
+    short = BranchLumen(healthy_mm=healthy, length_mm=float(arc[-1]), mean_diameter_mm=mean)
     at, reference = reference_stretch(branch)
     if not len(at):
         return short
+    healthy[at] = reference
     # The most severe narrowing, not the narrowest point, which may just be the thin far end.
     k = int(np.argmin(diameter[at] / reference))
     narrow = diameter[at] < (1 - LESION_SHARE) * reference

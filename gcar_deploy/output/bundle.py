@@ -13,7 +13,6 @@ from gcar_deploy.output.folder import write_folder
 from gcar_deploy.output.glb import glb_bytes
 from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
-from gcar_deploy.output.result import Result
 from gcar_deploy.output.tables import (
     centerline_csv,
     centerline_vtp,
@@ -21,6 +20,7 @@ from gcar_deploy.output.tables import (
     gaussians_ply,
 )
 from gcar_deploy.output.volume import nifti_bytes
+from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 
 RESULT_NAME = "result.json"
@@ -30,7 +30,7 @@ SURFACE_EDGE_MM = 0.4
 EXTRAS = {"glb": "surface.glb", "dicom-stl": "surface.dcm"}
 
 
-def render_files(result: Result, extras: Sequence[str] = ()) -> dict[str, bytes]:
+def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str, bytes]:
     """File name -> content of everything in the folder, ``result.json`` last.
 
     ``result.json`` lists size and SHA-256 of every other file under ``files``.
@@ -50,8 +50,8 @@ def render_files(result: Result, extras: Sequence[str] = ()) -> dict[str, bytes]
         "volume.nii.gz": lambda: nifti_bytes(result.volume, result.grid),
         "gaussians.npz": lambda: gaussians_npz(result.gaussians),
         "gaussians.ply": lambda: gaussians_ply(result.gaussians),
-        "centerline.vtp": lambda: centerline_vtp(result.tree, result.names),
-        "centerline.csv": lambda: centerline_csv(result.tree, result.names),
+        "centerline.vtp": lambda: centerline_vtp(result.tree, result.measured),
+        "centerline.csv": lambda: centerline_csv(result.tree, result.measured),
         "surface.stl": lambda: stl_bytes(surface),
     }
     if "glb" in extras:
@@ -63,20 +63,17 @@ def render_files(result: Result, extras: Sequence[str] = ()) -> dict[str, bytes]
             stl_bytes(surface), [angiogram.sha256 for angiogram in result.angiograms]
         )
     files = {name: make() for name, make in makers.items()}
-    pictures = [
-        overlay(angiogram.pixels, view, result.tree, judged, result.options.quality)
-        for angiogram, view, judged in zip(
-            result.angiograms, result.views, result.quality.views, strict=True
-        )
+    behind = [
+        backdrop(angiogram.pixels, missing)
+        for angiogram, missing in zip(result.angiograms, result.unexplained, strict=True)
     ]
-    for number, picture in enumerate(pictures, start=1):
+    drawn = zip(behind, result.views, result.quality.views, strict=True)
+    for number, (dimmed, view, judged) in enumerate(drawn, start=1):
+        picture = overlay(dimmed, view, result.tree, judged)
         files[f"overlay_view{number}.png"] = png_bytes(picture)
     summary = result.summary()
-    backdrops = [
-        backdrop(angiogram.pixels, view, result.tree, result.options.quality)[0]
-        for angiogram, view in zip(result.angiograms, result.views, strict=True)
-    ]
-    files["report.html"] = report_html(result, summary, backdrops).encode("utf-8")
+    pictures = [dimmed.picture for dimmed in behind]
+    files["report.html"] = report_html(result, summary, pictures).encode("utf-8")
     summary["files"] = {
         name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         for name, data in files.items()
@@ -95,7 +92,7 @@ def check_extras(extras: Sequence[str]) -> None:
 
 
 def write_result(
-    result: Result, out_dir: Path, *, force: bool = False, extras: Sequence[str] = ()
+    result: Reconstruction, out_dir: Path, *, force: bool = False, extras: Sequence[str] = ()
 ) -> Path:
     """Write the result folder, with the files of ``extras`` (names of ``EXTRAS``) in it.
 

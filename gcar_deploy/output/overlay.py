@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import colorsys
+import dataclasses
 import math
 
 import cv2
 import numpy as np
 
-from gcar_deploy.config import QualityOptions
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.quality import ViewQuality, unexplained
+from gcar_deploy.quality import ViewQuality
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Image, Mask, Pixels
 
@@ -49,24 +49,45 @@ def grey8(pixels: Image) -> Array:
     return stretched
 
 
-def overlay(
-    pixels: Image, view: VesselImage, tree: Tree, judged: ViewQuality, options: QualityOptions
-) -> Array:
-    """Draw one view.
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Backdrop:
+    """A dimmed picture, (rows, cols, 3) uint8 blue green red, enlarged by the whole number zoom."""
+
+    picture: Array
+    zoom: int
+
+
+def backdrop(pixels: Image, missing: Mask) -> Backdrop:
+    """Dim and enlarge a picture until it is at least 768 wide.
 
     Parameters
     ----------
     pixels : (rows, cols) float32 picture as it was given
-    view : what was found in it, with the C-arm as it was used (pose applied)
+    missing : (rows, cols) what the tree leaves unexplained, which becomes red
+    """
+    rows, columns = pixels.shape
+    zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
+    base = cv2.resize(grey8(pixels), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+    canvas = cv2.cvtColor((base * _DIM).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    _mark(canvas, missing, zoom)
+    return Backdrop(picture=canvas, zoom=zoom)
+
+
+def overlay(behind: Backdrop, view: VesselImage, tree: Tree, judged: ViewQuality) -> Array:
+    """Draw the tree over one view.
+
+    Parameters
+    ----------
+    behind : Backdrop
+    view : what was found in the picture, with the C-arm as it was used (pose applied)
     tree : Tree
     judged : ViewQuality, for the label
-    options : how near counts as explained
 
     Returns
     -------
-    (rows, cols, 3) uint8, blue green red, at least 768 wide
+    (rows, cols, 3) uint8, blue green red
     """
-    canvas, zoom = backdrop(pixels, view, tree, options)
+    canvas, zoom = behind.picture.copy(), behind.zoom
     lines = [_line(branch.points_mm, view.carm, zoom) for branch in tree.branches]
     width = max(2, round(canvas.shape[1] / 500))
     # A dark casing under each line keeps every colour readable on bright vessels.
@@ -80,21 +101,6 @@ def overlay(
     _labels(canvas, judged)
     _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom)
     return canvas
-
-
-def backdrop(
-    pixels: Image, view: VesselImage, tree: Tree, options: QualityOptions
-) -> tuple[Array, int]:
-    """Return the dimmed picture with what the tree leaves unexplained in red, and its zoom.
-
-    See ``overlay`` for the arguments; (rows, cols, 3) uint8, enlarged by the whole number zoom.
-    """
-    rows, columns = pixels.shape
-    zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
-    base = cv2.resize(grey8(pixels), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
-    canvas = cv2.cvtColor((base * _DIM).astype(np.uint8), cv2.COLOR_GRAY2BGR)
-    _mark(canvas, unexplained(tree, view, options), zoom)
-    return canvas, zoom
 
 
 def png_bytes(picture: Array) -> bytes:

@@ -14,9 +14,8 @@ from typing import Any
 import cv2
 
 from gcar_deploy.errors import GcarError
-from gcar_deploy.measure.lumen import foreshortening
 from gcar_deploy.output.report_data import scene_data
-from gcar_deploy.output.result import Result
+from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.types import Array
 
 _TEMPLATE = "report_template.html"
@@ -26,12 +25,14 @@ _PICTURE_SIDE = 1024
 _PICTURES_BYTES = 200_000
 
 
-def report_html(result: Result, summary: Mapping[str, Any], pictures: Sequence[Array]) -> str:
+def report_html(
+    result: Reconstruction, summary: Mapping[str, Any], pictures: Sequence[Array]
+) -> str:
     """Render the page.
 
     Parameters
     ----------
-    result : Result
+    result : Reconstruction
     summary : its ``summary()``
     pictures : (rows, cols, 3) uint8, blue green red, one per view, of any size; the reprojected
         tree is drawn over them by the page
@@ -59,15 +60,15 @@ def report_html(result: Result, summary: Mapping[str, Any], pictures: Sequence[A
             f"<th>view {html.escape(str(view['id']))}</th>" for view in summary["views"]
         ),
         "BRANCHES": "".join(
-            _branch(k, row, [foreshortening(branch, view.carm) for view in result.views])
-            for k, (row, branch) in enumerate(
-                zip(summary["tree"]["branches"], result.tree.branches, strict=True)
+            _branch(row, hidden)
+            for row, hidden in zip(
+                summary["tree"]["branches"], result.measured.hidden.tolist(), strict=True
             )
         ),
         "TIMINGS": _rows({k: f"{v:.2f} s" for k, v in summary["seconds"].items()}),
         "PROVENANCE": _rows(_provenance(summary)),
         "USE": html.escape(str(summary["use"])),
-        "DATA": _embedded(scene_data(result, summary["best_further_view"])),
+        "DATA": _embedded(scene_data(result)),
     }
     # One pass: a name of a view that looks like a mark is text.
     page = re.sub("__([A-Z]+)__", lambda mark: parts.get(mark[1], mark[0]), template)
@@ -162,17 +163,17 @@ def _angles(summary: Mapping[str, Any]) -> str:
     return _rows(rows) or "<tr><td>none</td></tr>"
 
 
-def branch_title(number: int, row: Mapping[str, Any]) -> str:
-    """Return the number of a branch, from 1, and its name with the probability if it has one."""
+def branch_title(row: Mapping[str, Any]) -> str:
+    """Return the number of a branch, and its name with the probability if it has one."""
     if row["name"] is None:
-        return str(number + 1)
+        return str(row["branch"])
     # Rounded down: what is not certain never reads 100 %.
-    return f"{number + 1} {row['name']} ({int(100 * row['name_confidence'])} %)"
+    return f"{row['branch']} {row['name']} ({int(100 * row['name_confidence'])} %)"
 
 
-def _branch(number: int, row: Mapping[str, Any], hidden: Sequence[float]) -> str:
+def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
     cells = [
-        html.escape(branch_title(number, row)),
+        html.escape(branch_title(row)),
         f"{row['length_mm']:.1f}",
         f"{2 * row['mean_radius_mm']:.2f}",
         _number(row["minimal_diameter_mm"]),
@@ -184,7 +185,8 @@ def _branch(number: int, row: Mapping[str, Any], hidden: Sequence[float]) -> str
     ]
     columns = "".join(f"<td>{cell}</td>" for cell in cells)
     return (
-        f'<tr data-branch="{number}"><td class="swatch"></td>{columns}<td class="short">-</td></tr>'
+        f'<tr data-branch="{row["branch"]}"><td class="swatch"></td>{columns}'
+        '<td class="short">-</td></tr>'
     )
 
 

@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.measure.lumen import branch_lumens
-from gcar_deploy.measure.naming import BranchName
+from gcar_deploy.measure.measured import Measured
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 
@@ -79,11 +78,10 @@ def gaussians_ply(gaussians: Gaussians) -> bytes:
     return ("\n".join(header) + "\n").encode("ascii") + columns.astype("<f4").tobytes()
 
 
-def centerline_vtp(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes:
+def centerline_vtp(tree: Tree, measured: Measured) -> bytes:
     """XML PolyData, one polyline per branch, mm LPS, for VMTK and 3D Slicer.
 
-    ``names`` has one entry per branch, or none at all. A branch without one has an empty
-    ``VesselName`` and no (NaN) ``NameConfidence``.
+    A branch without a name has an empty ``VesselName`` and no (NaN) ``NameConfidence``.
     """
     sizes = [len(branch) for branch in tree.branches]
     radius = tree.radii()
@@ -98,12 +96,12 @@ def centerline_vtp(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes
         "StartNode": np.array([branch.start for branch in tree.branches], dtype=np.int64),
         "EndNode": np.array([branch.end for branch in tree.branches], dtype=np.int64),
         "Length": np.array([branch.length_mm for branch in tree.branches], dtype=np.float64),
-        "MinimalDiameter": _of_lumens(tree, "minimal_diameter_mm"),
-        "ReferenceDiameter": _of_lumens(tree, "reference_diameter_mm"),
-        "StenosisPercent": _of_lumens(tree, "stenosis_percent"),
-        "LesionLength": _of_lumens(tree, "lesion_length_mm"),
+        "MinimalDiameter": _of_lumens(measured, "minimal_diameter_mm"),
+        "ReferenceDiameter": _of_lumens(measured, "reference_diameter_mm"),
+        "StenosisPercent": _of_lumens(measured, "stenosis_percent"),
+        "LesionLength": _of_lumens(measured, "lesion_length_mm"),
     }
-    told = _told(tree, names)
+    told = _told(measured)
     count = int(sum(sizes))
     out = [
         '<?xml version="1.0"?>',
@@ -133,7 +131,7 @@ def centerline_vtp(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes
     return ("\n".join(out) + "\n").encode("ascii")
 
 
-def centerline_csv(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes:
+def centerline_csv(tree: Tree, measured: Measured) -> bytes:
     """One row per centreline point; an unknown sigma or name is an empty field.
 
     Branches are numbered from 1, as in the pictures, the report and ``centerline.vtp``.
@@ -142,7 +140,7 @@ def centerline_csv(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes
     writer = csv.writer(stream, lineterminator="\n")
     columns_of_points = ["arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
     writer.writerow(["branch", "point", *columns_of_points, "name", "name_confidence"])
-    told = _told(tree, names)
+    told = _told(measured)
     for number, (branch, (name, share)) in enumerate(zip(tree.branches, told, strict=True), 1):
         columns = np.column_stack(
             [branch.arc_mm, branch.points_mm, branch.radius_mm, branch.sigma_mm, branch.confidence]
@@ -153,12 +151,11 @@ def centerline_csv(tree: Tree, names: Sequence[BranchName | None] = ()) -> bytes
     return stream.getvalue().encode("ascii")
 
 
-def _told(tree: Tree, names: Sequence[BranchName | None]) -> list[tuple[str, float]]:
+def _told(measured: Measured) -> list[tuple[str, float]]:
     """Name and its probability per branch; empty and NaN where there is none."""
-    of_branch = names or [None] * len(tree.branches)
     return [
         ("", float("nan")) if name is None else (name.name, name.confidence)
-        for name, _ in zip(of_branch, tree.branches, strict=True)
+        for name in measured.names
     ]
 
 
@@ -176,9 +173,9 @@ def _of_points(tree: Tree, name: str) -> Array:
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def _of_lumens(tree: Tree, name: str) -> Array:
+def _of_lumens(measured: Measured, name: str) -> Array:
     """(branches,) float64 figure of each branch, NaN where it is too short to say."""
-    values = [getattr(lumen, name) for lumen in branch_lumens(tree)]
+    values = [getattr(lumen, name) for lumen in measured.lumens]
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 

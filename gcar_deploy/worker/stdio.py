@@ -16,7 +16,7 @@ from typing import IO, Any
 from gcar_deploy import __version__
 from gcar_deploy.errors import GcarError, GeometryError, UsageError
 from gcar_deploy.geometry.fields import read_json
-from gcar_deploy.output.result import RESEARCH_USE
+from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue
 from gcar_deploy.worker.orders import parse_order

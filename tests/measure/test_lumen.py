@@ -5,7 +5,6 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.measure.lumen import (
     bifurcation_angles,
     branch_lumen,
-    branch_lumens,
     foreshortening,
 )
 from gcar_deploy.tree.tree import Tree
@@ -33,7 +32,7 @@ def test_healthy_taper_is_no_stenosis():
 
 
 def test_a_short_branch_states_no_stenosis():
-    out = branch_lumens(tube(length=4, radius=1.5, count=5))[0]
+    out = branch_lumen(tube(length=4, radius=1.5, count=5).branches[0])
     assert out.length_mm == pytest.approx(4)
     assert out.stenosis_percent is None
 

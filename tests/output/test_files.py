@@ -11,10 +11,11 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from gcar_deploy.measure.measured import measured
 from gcar_deploy.output.bundle import render_files
-from gcar_deploy.output.result import plain
 from gcar_deploy.output.tables import centerline_vtp, gaussians_ply
 from gcar_deploy.output.volume import nifti_bytes
+from gcar_deploy.reconstruction import plain
 
 
 @pytest.mark.req("REQ-25")
@@ -153,12 +154,12 @@ def test_centreline_by_vtk(result, folder):
         start += len(branch)
 
 
-def test_an_empty_tree_is_a_valid_file(tmp_path):
+def test_an_empty_tree_is_a_valid_file(result, tmp_path):
     vtk = pytest.importorskip("vtk")
     from gcar_deploy.tree.tree import empty_tree
 
     file = tmp_path / "empty.vtp"
-    file.write_bytes(centerline_vtp(empty_tree()))
+    file.write_bytes(centerline_vtp(empty_tree(), measured(empty_tree(), result.views)))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))
     reader.Update()

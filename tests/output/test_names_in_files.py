@@ -73,7 +73,7 @@ def test_report(files, named):
     page = files["report.html"].decode("utf-8")
     percent = int(100 * named.names[0].confidence)
     assert f"<td>1 LM ({percent} %)</td>" in page and "<td>5</td>" in page
-    assert [branch["name"] for branch in scene_data(named, None)["branches"]] == NAMES
+    assert [branch["name"] for branch in scene_data(named)["branches"]] == NAMES
 
 
 def test_info_without_a_name():

@@ -110,8 +110,9 @@ def test_the_report_has_the_numbers_and_directions_of_the_csv(files, rows, told)
     page = files["report.html"].decode("utf-8")
     data = json.loads(re.search(r'type="application/json"[^>]*>(.*?)</script>', page, re.S)[1])
     shown = re.findall(r'<tr data-branch="(\d+)"><td class="swatch"></td><td>(\d+)[ <]', page)
-    assert shown == [(str(k), str(k + 1)) for k in range(5)]
+    assert shown == [(str(k), str(k)) for k in range(1, 6)]
     for number, drawn in enumerate(data["branches"], start=1):
+        assert drawn["branch"] == number
         np.testing.assert_allclose(drawn["points"][0], place(rows[number][0]), atol=0.01)
         np.testing.assert_allclose(drawn["points"][-1], place(rows[number][-1]), atol=0.01)
         assert drawn["arc"][0] == 0

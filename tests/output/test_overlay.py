@@ -10,7 +10,7 @@ import pytest
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.output.overlay import branch_color, grey8, overlay, png_bytes
+from gcar_deploy.output.overlay import backdrop, branch_color, grey8, overlay, png_bytes
 from gcar_deploy.quality.status import ViewQuality, unexplained, view_quality
 from gcar_deploy.tree.tree import Branch, Tree, empty_tree
 
@@ -44,9 +44,9 @@ def line_tree(carm):
     return Tree(nodes_mm=ends, branches=(branch,))
 
 
-def picture_of(view, tree):
+def picture_of(view, tree, judged=JUDGED):
     pixels = np.zeros((view.carm.rows, view.carm.columns), np.float32)
-    return overlay(pixels, view, tree, JUDGED, OPTIONS)
+    return overlay(backdrop(pixels, unexplained(tree, view, OPTIONS)), view, tree, judged)
 
 
 def test_line_lies_where_the_c_arm_projects_it():
@@ -92,7 +92,7 @@ def test_wide_enough_to_read_and_never_huge(shape):
 def test_names_that_the_font_lacks_or_that_are_too_long():
     view = blank_view()
     judged = dataclasses.replace(JUDGED, view_id="ü" * 300)
-    picture = overlay(np.zeros((128, 96), np.float32), view, empty_tree(), judged, OPTIONS)
+    picture = picture_of(view, empty_tree(), judged)
     assert picture.shape[1] >= 768
 
 

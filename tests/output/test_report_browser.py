@@ -186,13 +186,13 @@ def test_hovering_a_row_dims_the_others_and_a_click_chooses(opened):
     rows.nth(1).hover()
     assert colors(page, ".lines[data-view='0']") != before
     rows.nth(1).click()
-    assert page.locator("#branches tr.chosen").get_attribute("data-branch") == "1"
+    assert page.locator("#branches tr.chosen").get_attribute("data-branch") == "2"
 
 
 def test_fingers_on_a_tablet(opened):
     page = opened(width=820, touch=True)
     page.locator("#branches tr").nth(2).tap()
-    assert page.locator("#branches tr.chosen").get_attribute("data-branch") == "2"
+    assert page.locator("#branches tr.chosen").get_attribute("data-branch") == "3"
     curve = page.locator("#curve")
     curve.scroll_into_view_if_needed()
     box = curve.bounding_box()

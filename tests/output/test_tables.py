@@ -49,7 +49,7 @@ def test_vtp_cells(result, tmp_path):
     from vtk.util.numpy_support import vtk_to_numpy
 
     file = tmp_path / "line.vtp"
-    file.write_bytes(centerline_vtp(result.tree))
+    file.write_bytes(centerline_vtp(result.tree, result.measured))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))
     reader.Update()
@@ -69,7 +69,7 @@ def test_csv_numbers_arcs_and_unknown_sigma(result):
     tree = result.tree
     hidden = dataclasses.replace(tree.branches[0], sigma_mm=np.full(len(tree.branches[0]), np.nan))
     tree = dataclasses.replace(tree, branches=(hidden, *tree.branches[1:]))
-    rows = list(csv.DictReader(io.StringIO(centerline_csv(tree).decode("ascii"))))
+    rows = list(csv.DictReader(io.StringIO(centerline_csv(tree, result.measured).decode("ascii"))))
     assert [int(row["branch"]) for row in rows] == list(tree.branch_index() + 1)
     assert {row["sigma_mm"] for row in rows if row["branch"] == "1"} == {""}
     last = [row for row in rows if row["branch"] == "1"][-1]
@@ -95,7 +95,7 @@ def test_report_stays_small_for_noisy_pictures_and_long_trees(result):
     noise = np.random.default_rng(0).normal(120, 12, (512, 512)).clip(0, 255).astype(np.uint8)
     picture = np.repeat(np.kron(noise, np.ones((2, 2), np.uint8))[..., None], 3, axis=2)
     assert len(report_html(long, long.summary(), [picture, picture])) < 500_000
-    drawn = scene_data(long, None)["branches"]
+    drawn = scene_data(long)["branches"]
     assert sum(len(branch["points"]) for branch in drawn) < 2100
     assert all(branch["arc"][-1] == pytest.approx(tree.branches[0].length_mm, abs=0.01)
                for branch in drawn)  # fmt: skip
@@ -120,13 +120,14 @@ def test_lumen_figures_are_in_the_summary_and_in_the_vtp(result, tmp_path):
         sigma_mm=np.full(81, 0.1), confidence=np.ones(81), start=0, end=1,
     )  # fmt: skip
     tree = Tree(nodes_mm=narrow.points_mm[[0, -1]], branches=(narrow,))
-    row = dataclasses.replace(result, tree=tree).summary()["tree"]["branches"][0]
+    narrowed = dataclasses.replace(result, tree=tree)
+    row = narrowed.summary()["tree"]["branches"][0]
     assert row["minimal_diameter_mm"] == pytest.approx(1.5, abs=1e-6)
     assert row["minimal_at_mm"] == pytest.approx(20.0)
     assert row["stenosis_percent"] == pytest.approx(50.0, abs=2.0)
     assert row["lesion_length_mm"] == pytest.approx(2 * 2.5 * np.sqrt(2 * np.log(2)), abs=1.0)
     file = tmp_path / "line.vtp"
-    file.write_bytes(centerline_vtp(tree))
+    file.write_bytes(centerline_vtp(tree, narrowed.measured))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))
     reader.Update()

@@ -1,14 +1,14 @@
-"""Result: everything one reconstruction found, as arrays, as JSON, as a folder."""
+"""Reconstruction: everything that was found, as arrays and as the content of result.json."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,13 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import EXACT_DISAGREEMENT, silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.measure.further_view import best_further_view
-from gcar_deploy.measure.lumen import BranchLumen, bifurcation_angles, branch_lumens
-from gcar_deploy.measure.naming import LEAST_CONFIDENCE, BranchName, read_anatomy
+from gcar_deploy.measure.lumen import BranchLumen
+from gcar_deploy.measure.measured import Measured, measured
+from gcar_deploy.measure.naming import LEAST_CONFIDENCE, BranchName
 from gcar_deploy.pose import Pose
-from gcar_deploy.quality import Quality
+from gcar_deploy.quality import Quality, unexplained
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Volume
+from gcar_deploy.types import Mask, Volume
 
 SCHEMA = "gcar-result/1"
 RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or treatment."
@@ -40,8 +40,8 @@ _LUMEN = (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Result:
-    """One reconstruction.
+class Reconstruction:
+    """What one reconstruction found; what follows from it is worked out once, when first asked.
 
     Attributes
     ----------
@@ -98,14 +98,32 @@ class Result:
         return calibrated and after is not None and after <= EXACT_DISAGREEMENT
 
     @functools.cached_property
+    def measured(self) -> Measured:
+        """Lumen, names, angles, foreshortening and the view to take next."""
+        return measured(self.tree, self.views)
+
+    @functools.cached_property
+    def unexplained(self) -> tuple[Mask, ...]:
+        """Per view (rows, cols) the pixels of its skeleton that no branch explains."""
+        return tuple(unexplained(self.tree, view, self.options.quality) for view in self.views)
+
+    @property
     def names(self) -> tuple[BranchName | None, ...]:
         """Name of each branch (LM, LAD, LCx, RCA) with its probability; None: a number only."""
-        return read_anatomy(self.tree).names
+        return self.measured.names
 
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
+        return copy.deepcopy(self._summary)
+
+    def to_json(self) -> str:
+        """``summary`` as strict JSON text."""
+        return json.dumps(self._summary, indent=1, allow_nan=False) + "\n"
+
+    @functools.cached_property
+    def _summary(self) -> dict[str, Any]:
         reasons: dict[str, str] = {}
-        further = best_further_view(self.tree, self._carms)
+        further = self.measured.further
         body = {
             "schema": SCHEMA,
             "status": self.quality.status,
@@ -121,11 +139,11 @@ class Result:
                 "branches": [
                     {"branch": number, **_branch(branch, lumen, name)}
                     for number, (branch, lumen, name) in enumerate(
-                        zip(self.tree.branches, branch_lumens(self.tree), self.names, strict=True),
+                        zip(self.tree.branches, self.measured.lumens, self.names, strict=True),
                         start=1,
                     )
                 ],
-                "bifurcations": bifurcations(self.tree),
+                "bifurcations": self._bifurcations(),
             },
             "volume": {
                 "center_mm": list(self.grid.center_mm),
@@ -157,21 +175,17 @@ class Result:
         out["reasons"] = reasons
         return out
 
-    def to_json(self) -> str:
-        """``summary`` as strict JSON text."""
-        return json.dumps(self.summary(), indent=1, allow_nan=False) + "\n"
-
-    def save(self, out_dir: str | Path, *, force: bool = False, extras: Sequence[str] = ()) -> Path:
-        """Write the result folder, all or nothing; see ``output.bundle``.
-
-        Parameters
-        ----------
-        force : replace an existing folder
-        extras : of ``glb`` (surface.glb) and ``dicom-stl`` (surface.dcm)
-        """
-        from gcar_deploy.output.bundle import write_result
-
-        return write_result(self, Path(out_dir), force=force, extras=extras)
+    def _bifurcations(self) -> list[dict[str, Any]]:
+        """Nodes where three or more branches meet, with the angle between each two of them."""
+        found: dict[int, dict[str, Any]] = {}
+        for angle in self.measured.angles:
+            place = self.tree.nodes_mm[angle.node].tolist()
+            node = found.setdefault(
+                angle.node, {"node": angle.node, "position_mm": place, "angles": []}
+            )
+            pair = [angle.first + 1, angle.second + 1]
+            node["angles"].append({"branches": pair, "angle_deg": angle.angle_deg})
+        return list(found.values())
 
     def _view(self, k: int) -> dict[str, Any]:
         angiogram, judged, pose = self.angiograms[k], self.quality.views[k], self.poses[k]
@@ -212,25 +226,6 @@ def versions() -> dict[str, str | None]:
         except metadata.PackageNotFoundError:
             found[name] = None
     return found
-
-
-def bifurcations(tree: Tree) -> list[dict[str, Any]]:
-    """Nodes where three or more branches meet, with the angle between each two of them.
-
-    Branches have their numbers, from 1.
-    """
-    found: dict[int, dict[str, Any]] = {}
-    for angle in bifurcation_angles(tree):
-        place = tree.nodes_mm[angle.node].tolist()
-        node = found.setdefault(
-            angle.node, {"node": angle.node, "position_mm": place, "angles": []}
-        )
-        pair = {
-            "branches": [angle.first + 1, angle.second + 1],
-            "angle_deg": angle.angle_deg,
-        }
-        node["angles"].append(pair)
-    return list(found.values())
 
 
 def _branch(branch: Branch, lumen: BranchLumen, name: BranchName | None) -> dict[str, Any]:
