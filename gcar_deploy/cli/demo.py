@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ from gcar_deploy.cli.common import (
 )
 @engine_options
 @backend_options
-@click.option("--force", is_flag=True, help="Replace an existing folder.")
+@click.option("--force", is_flag=True, help="Replace any result of gcar.")
 @output_options
 def demo(
     out_dir: Path,
@@ -50,7 +52,8 @@ def demo(
     """Reconstruct a real patient's left coronary tree from two simulated pictures.
 
     The folder holds the pictures to look at (overlay_view1.png, report.html); the table
-    compares the tree with the truth that the pictures were made from.
+    compares the tree with the truth that the pictures were made from. An earlier demo in the
+    folder is replaced.
 
     \b
     Example:
@@ -59,14 +62,15 @@ def demo(
     started = time.perf_counter()
     set_up_logging(verbose, quiet)
     limit_threads(threads)
+    from gcar_deploy.data.demo_case import demo_case
     from gcar_deploy.output.folder import check_target
 
+    case = demo_case()
+    force = force or _holds_a_demo(out_dir, case.pictures)
     check_target(out_dir, force=force)
-    from gcar_deploy.data.demo_case import demo_case
     from gcar_deploy.engine import Engine
     from gcar_deploy.measure.metrics import volume_measures
 
-    case = demo_case()
     engine = Engine(
         model, threads=threads, options=run_options(predictor, refiner, backend, device)
     )
@@ -85,6 +89,15 @@ def demo(
         click.echo(json.dumps(out, allow_nan=False))
     else:
         click.echo("\n".join(lines(result, measures, out_dir, whole)))
+
+
+def _holds_a_demo(folder: Path, pictures: Sequence[Path]) -> bool:
+    """Whether a folder holds a result of the demo's own pictures, which anyone can make again."""
+    from gcar_deploy.output.folder import manifest_of
+
+    views = (manifest_of(folder) or {}).get("views", [])
+    own = [hashlib.sha256(path.read_bytes()).hexdigest() for path in pictures]
+    return [view["picture"]["sha256"] for view in views] == own
 
 
 def lines(result: Any, measures: Any, out_dir: Path, whole: float) -> list[str]:

@@ -50,7 +50,7 @@ from gcar_deploy.cli.common import chosen_dicom
     show_default=True,
     help="Who finds the vessels; both writes classic and net_ pictures side by side.",
 )
-@click.option("--force", is_flag=True, help="Replace an existing folder.")
+@click.option("--force", is_flag=True, help="Replace a folder that gcar wrote.")
 def enhance(
     picture: Path,
     out_dir: Path,

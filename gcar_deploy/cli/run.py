@@ -41,7 +41,7 @@ from gcar_deploy.cli.hints import given_masks, hint_options, hinted
 @dicom_options
 @hint_options
 @click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
-@click.option("--force", is_flag=True, help="Replace an existing folder.")
+@click.option("--force", is_flag=True, help="Replace a folder that gcar wrote.")
 @click.option("--glb", is_flag=True, help="Write surface.glb as well.")
 @click.option(
     "--dicom-stl", is_flag=True, help="Write surface.dcm (DICOM Encapsulated STL) as well."

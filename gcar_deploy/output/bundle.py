@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gcar_deploy.errors import UsageError
-from gcar_deploy.output.folder import write_folder
+from gcar_deploy.output.folder import listed, write_folder
 from gcar_deploy.output.glb import glb_bytes
 from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
@@ -74,10 +73,7 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
     summary = result.summary()
     pictures = [dimmed.picture for dimmed in behind]
     files["report.html"] = report_html(result, summary, pictures).encode("utf-8")
-    summary["files"] = {
-        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-        for name, data in files.items()
-    }
+    summary["files"] = listed(files)
     files[RESULT_NAME] = (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode("utf-8")
     return files
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import hashlib
+import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.files import read_bounded
 from gcar_deploy.output.scratch import FRESH, OLD, scratch_folder, sweep
 
 _AT_FDCWD = -100
@@ -18,14 +22,27 @@ _RENAME_NOREPLACE = 1
 _RENAME_EXCHANGE = 2
 
 
+#: the file that lists all others of a folder; the first is what ``gcar run`` writes anyway
+MANIFESTS = ("result.json", "manifest.json")
+_SCHEMA, _MOST_BYTES = "gcar-folder/1", 2**26
+#: what desktops leave in every folder that is looked at
+_LEFT_BY_DESKTOPS = {".DS_Store", "Thumbs.db", "desktop.ini"}
+
+
 def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -> None:
     """Refuse a folder that must not be written, before any work is done.
+
+    Parameters
+    ----------
+    out_dir : the folder to be
+    force : whether a folder that this program wrote may be replaced; no other ever is
+    inputs : files that must not go with it
 
     Raises
     ------
     UsageError
-        ``out_dir`` is a link or a file, exists without ``force``, holds an input or the
-        working folder, or no folder can be made there.
+        ``out_dir`` is a link or a file, exists without ``force``, holds what this program did
+        not write, an input or the working folder, or no folder can be made there.
     """
     try:
         linked = out_dir.is_symlink()
@@ -35,16 +52,9 @@ def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -
     if linked:
         raise UsageError(f"{out_dir} is a symbolic link; name a folder of its own")
     if out_dir.exists():
-        if not out_dir.is_dir():
-            raise UsageError(f"{out_dir} is a file; name a folder")
+        _check_existing(out_dir, inputs)
         if not force:
             raise UsageError(f"{out_dir} exists; choose another folder or add --force")
-        if out_dir.is_mount():
-            raise UsageError(f"{out_dir} is a mount point, which cannot be replaced")
-        whole = out_dir.resolve()
-        for precious in (Path.cwd(), Path.home(), *(path.resolve() for path in inputs)):
-            if precious == whole or whole in precious.parents:
-                raise UsageError(f"{out_dir} holds {precious}; --force would delete that")
     ancestor = out_dir.absolute().parent
     while not ancestor.exists() and not ancestor.is_symlink():
         ancestor = ancestor.parent
@@ -54,12 +64,70 @@ def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -
         raise UsageError(f"{out_dir} cannot be made: {ancestor} is not writable")
 
 
+def _check_existing(out_dir: Path, inputs: tuple[Path, ...]) -> None:
+    """Refuse what stays whether ``force`` is given or not, so that no one is told to give it."""
+    if not out_dir.is_dir():
+        raise UsageError(f"{out_dir} is a file; name a folder")
+    # Not of the path as given: "." is its own parent, and so looks like a mount point.
+    whole = out_dir.resolve()
+    if whole.is_mount():
+        raise UsageError(f"{out_dir} is a mount point, which cannot be replaced; name a new folder")
+    for precious, what in (
+        (Path.cwd(), "working folder"), (Path.home(), "home folder"),
+        *((path.resolve(), f"input {path.name}") for path in inputs),
+    ):  # fmt: skip
+        if precious == whole:
+            raise UsageError(f"{out_dir} is the {what}, which is not replaced; name a new folder")
+        if whole in precious.parents:
+            raise UsageError(f"{out_dir} holds the {what}, which is not deleted; name a new folder")
+    other = in_the_way(out_dir)
+    if other is not None:
+        raise UsageError(
+            f"{out_dir} holds {other}, which gcar did not write, and is not replaced, also not "
+            "with --force; name another folder"
+        )
+
+
+def manifest_of(folder: Path) -> dict[str, Any] | None:
+    """Content of the manifest that this program wrote into a folder; None without one."""
+    for name in MANIFESTS:
+        try:
+            found = json.loads(read_bounded(folder / name, _MOST_BYTES))
+        except (ValueError, RecursionError):  # no such file, or no JSON
+            continue
+        ours = isinstance(found, dict) and str(found.get("schema", "")).startswith("gcar-")
+        if ours and isinstance(found.get("files"), dict):
+            return dict(found)
+    return None
+
+
+def in_the_way(folder: Path) -> str | None:
+    """Name of something in a folder that this program did not write; None where there is none."""
+    manifest = manifest_of(folder)
+    known = set(_LEFT_BY_DESKTOPS)
+    if manifest is not None:
+        known.update(MANIFESTS, manifest["files"])
+    try:
+        return min((path.name for path in folder.iterdir() if path.name not in known), default=None)
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be read ({error.strerror})") from None
+
+
+def listed(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of each file, as a manifest lists them."""
+    return {
+        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in files.items()
+    }
+
+
 def write_folder(out_dir: Path, files: Mapping[str, bytes], *, force: bool = False) -> None:
     """Write files into a new folder by way of a temporary one beside it and a rename.
 
     The files are on the disk before the rename. An existing folder (with ``force``) is
     exchanged in one step where the system can, and removed afterwards; whatever happens, one
     of the two complete folders stands at ``out_dir``. What killed runs left beside it is removed.
+    Where the files have no ``result.json``, a ``manifest.json`` with their list is written too.
 
     Raises
     ------
@@ -69,6 +137,9 @@ def write_folder(out_dir: Path, files: Mapping[str, bytes], *, force: bool = Fal
         The disk refused.
     """
     check_target(out_dir, force=force)
+    if not any(name in files for name in MANIFESTS):
+        text = json.dumps({"schema": _SCHEMA, "files": listed(files)}, indent=1) + "\n"
+        files = {**files, "manifest.json": text.encode("utf-8")}
     try:
         with _parents(out_dir), scratch_folder(out_dir.absolute().parent) as scratch:
             fresh = scratch / FRESH

@@ -93,9 +93,13 @@ def test_json_of_a_refusal_is_one_object_too(good_case, tmp_path):
 def test_force_replaces_and_info_reads(good_case, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    (out / "old").write_text("1")
+    (out / "thesis.txt").write_text("1")
+    done = gcar(*run_arguments(good_case, out, "--force"))
+    assert done.code == 2 and "thesis.txt" in done.err and (out / "thesis.txt").exists()
+    (out / "thesis.txt").unlink()
     assert gcar(*run_arguments(good_case, out, "--force")).code == 0
-    assert not (out / "old").exists()
+    assert gcar(*run_arguments(good_case, out)).code == 2
+    assert gcar(*run_arguments(good_case, out, "--force")).code == 0
     done = gcar("info", out)
     assert done.code == 0 and "branches" in done.out and "Research use only" in done.out
     assert json.loads(gcar("info", out, "--json").out)["altered"] == []
@@ -103,6 +107,18 @@ def test_force_replaces_and_info_reads(good_case, tmp_path):
         stream.write("x")
     done = gcar("info", out)
     assert done.code == 2 and "centerline.csv" in done.err
+
+
+def test_a_second_demo_takes_the_place_of_the_first_and_of_nothing_else(good_case, tmp_path):
+    out = tmp_path / "gcar-demo"
+    demo = ("demo", "--out", out, "--predictor", "none", "--refiner", "none", "--quiet")
+    for _ in range(2):
+        done = gcar(*demo)
+        assert done.code == 0, done.err
+    shutil.rmtree(out)
+    assert gcar(*run_arguments(good_case, out)).code == 0
+    done = gcar(*demo)
+    assert done.code == 2 and "add --force" in done.err
 
 
 @pytest.mark.parametrize("content", [None, "{", "[]", '{"schema": "other"}'])

@@ -25,9 +25,9 @@ def test_four_pictures_at_the_size_of_the_first(tmp_path, picture):
     out = tmp_path / "deep" / "steps"
     done = _run(picture, "--out", out, "--pixel-mm", 0.3)
     assert done.exit_code == 0, done.output
-    names = ["mask.png", "skeleton.png", "steps.png", "vesselness.png"]
+    names = ["manifest.json", "mask.png", "skeleton.png", "steps.png", "vesselness.png"]
     assert sorted(p.name for p in out.iterdir()) == names
-    for path in out.iterdir():
+    for path in out.glob("*.png"):
         assert cv2.imread(str(path), -1).shape[:2] == (256, 256)
     assert [p.name for p in out.parent.iterdir()] == ["steps"]
 
@@ -36,10 +36,14 @@ def test_existing_folder_needs_force(tmp_path, picture):
     out = tmp_path / "steps"
     out.mkdir()
     (out / "mine.txt").write_text("x")
+    for more in ((), ("--force",)):
+        assert "mine.txt" in str(_run(picture, "--out", out, *more).exception)
+        assert [p.name for p in out.iterdir()] == ["mine.txt"]
+    (out / "mine.txt").unlink()
     assert isinstance(_run(picture, "--out", out).exception, UsageError)
-    assert (out / "mine.txt").exists()
     assert _run(picture, "--out", out, "--force").exit_code == 0
-    assert len(list(out.iterdir())) == 4
+    assert _run(picture, "--out", out, "--force").exit_code == 0
+    assert len(list(out.iterdir())) == 5
 
 
 def test_nothing_is_written_on_refusal(tmp_path):

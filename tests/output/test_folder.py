@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -13,13 +15,18 @@ import pytest
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.output import folder
-from gcar_deploy.output.folder import check_target, write_folder
+from gcar_deploy.output.folder import check_target, in_the_way, write_folder
 
 FILES = {"a.txt": b"alpha", "b.bin": bytes(range(256))}
 
 
 def listing(path: Path) -> dict[str, bytes]:
-    return {p.relative_to(path).as_posix(): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+    """All files but the manifest."""
+    return {
+        p.relative_to(path).as_posix(): p.read_bytes()
+        for p in path.rglob("*")
+        if p.is_file() and p.name != "manifest.json"
+    }
 
 
 def test_writes_exactly_the_files_and_nothing_beside(tmp_path):
@@ -69,18 +76,79 @@ def test_links_and_files_are_refused(tmp_path, kind):
     assert out.is_symlink() or out.read_bytes() == b"1"
 
 
-def test_force_never_takes_inputs_or_the_working_folder_along(tmp_path, monkeypatch):
+@pytest.mark.parametrize("force", [False, True])
+def test_inputs_and_the_working_folder_are_never_taken_along(tmp_path, monkeypatch, force):
+    """With or without --force, so that no one is told to add what does not help."""
     out = tmp_path / "out"
-    out.mkdir()
-    picture = out / "view1.png"
-    picture.write_bytes(b"1")
-    with pytest.raises(UsageError, match="delete"):
-        check_target(out, force=True, inputs=(picture,))
+    write_folder(out, {"view1.png": b"1"})
+    with pytest.raises(UsageError, match=r"holds the input view1.png, which is not deleted"):
+        check_target(out, force=force, inputs=(out / "view1.png",))
     monkeypatch.chdir(out)
-    with pytest.raises(UsageError, match="delete"):
-        check_target(out, force=True)
-    with pytest.raises(UsageError):
-        check_target(Path("."), force=True)
+    for name in (".", out):
+        with pytest.raises(UsageError, match=r"is the working folder") as told:
+            check_target(Path(name), force=force)
+        assert "--force" not in str(told.value)
+    with pytest.raises(UsageError, match=r"\.\. holds the working folder"):
+        check_target(Path(".."), force=force)
+    with pytest.raises(UsageError, match="mount point"):
+        check_target(Path("/"), force=force)
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"thesis.txt": "x"},
+        {"thesis.txt": "x", "result.json": "{"},
+        {"thesis.txt": "x", "result.json": '{"schema": "other/1", "files": {"thesis.txt": {}}}'},
+        {"thesis.txt": "x", "manifest.json": '{"files": {"thesis.txt": {}}}'},
+        {"thesis.txt": "x", "manifest.json": "[" * 100_000},
+        {"chapters/one.txt": "x"},
+    ],
+    ids=["alone", "no json", "another's", "no schema", "deep", "a folder"],
+)
+def test_what_others_wrote_is_never_replaced(tmp_path, force, content):
+    out = tmp_path / "out"
+    for name, text in content.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    first = min(p.name for p in out.iterdir())
+    with pytest.raises(UsageError, match=rf"holds {first}, which gcar did not write") as told:
+        write_folder(out, FILES, force=force)
+    assert told.value.exit_code == 2
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_what_was_put_beside_a_result_is_in_the_way(tmp_path):
+    out = tmp_path / "out"
+    write_folder(out, FILES)
+    assert in_the_way(out) is None
+    (out / ".DS_Store").write_bytes(b"1")
+    write_folder(out, FILES, force=True)
+    (out / "thesis.txt").write_text("x")
+    with pytest.raises(UsageError, match=r"holds thesis.txt.*--force"):
+        write_folder(out, FILES, force=True)
+    assert (out / "thesis.txt").read_text() == "x"
+
+
+def test_an_empty_folder_may_be_replaced(tmp_path):
+    (tmp_path / "out").mkdir()
+    with pytest.raises(UsageError, match="add --force"):
+        write_folder(tmp_path / "out", FILES)
+    write_folder(tmp_path / "out", FILES, force=True)
+    assert listing(tmp_path / "out") == FILES
+
+
+def test_the_manifest_lists_every_file(tmp_path):
+    write_folder(tmp_path / "out", FILES)
+    told = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert told["schema"] == "gcar-folder/1" and told["files"].keys() == FILES.keys()
+    for name, data in FILES.items():
+        assert told["files"][name]["sha256"] == hashlib.sha256(data).hexdigest()
+    own = {"result.json": b'{"schema": "gcar-result/1", "files": {}}'}
+    write_folder(tmp_path / "result", own)
+    assert [p.name for p in (tmp_path / "result").iterdir()] == ["result.json"]
 
 
 def test_a_file_in_the_way_of_the_parents(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -13,7 +14,7 @@ import pytest
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output import folder
-from gcar_deploy.output.folder import write_folder
+from gcar_deploy.output.folder import listed, write_folder
 
 NAMES = [f"file{k}.bin" for k in range(6)]
 SCRIPT = """
@@ -45,8 +46,11 @@ def test_twenty_kills_never_leave_half_a_folder(tmp_path):
             process.send_signal(signal.SIGKILL)
             process.wait(timeout=30)
         assert process.returncode == -signal.SIGKILL
-        assert sorted(p.name for p in out.iterdir()) == NAMES
-        contents = {p.read_bytes() for p in out.iterdir()}
+        assert sorted(p.name for p in out.iterdir()) == [*NAMES, "manifest.json"]
+        contents = {(out / name).read_bytes() for name in NAMES}
+        assert json.loads((out / "manifest.json").read_text())["files"] == listed(
+            {name: (out / name).read_bytes() for name in NAMES}
+        )
         assert len(contents) == 1, "files of two runs in one folder"
         seen |= contents
         # What a kill leaves is only its own hidden folder, readable by nobody else; the next
