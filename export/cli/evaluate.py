@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -26,7 +27,8 @@ class _Progress:
     """A bar on a terminal, a line per row elsewhere; on stderr, nothing with ``quiet``."""
 
     def __init__(self, *, quiet: bool) -> None:
-        self._quiet, self._bar, self._at = quiet, None, 0
+        self._quiet, self._at = quiet, 0
+        self._bar: Any = None
 
     def __call__(self, done: int, total: int, text: str) -> None:
         if self._quiet:

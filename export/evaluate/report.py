@@ -65,7 +65,7 @@ def tree_figure(out: Path, protocol: str, case: str, views: int, methods: Sequen
     for column, method in enumerate((TRUTH, *methods)):
         sides = _read(sides_path(out, protocol, case, views, method))
         parts = [None] * 3 if sides is None or truth is None else _split(sides, truth)
-        boxes = [None] * 3 if truth is None else _boxes(truth)
+        boxes: Any = [None] * 3 if truth is None else _boxes(truth)
         title = method
         if sides is not None and sides.max() < HALF:
             title += "\n(below 0.5: grey)"

@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import nibabel
 import numpy as np
@@ -118,11 +119,11 @@ def table(scores: Sequence[Score]) -> str:
 
 
 def _read(folder: Path, out: Path) -> tuple[Array, Array | None, str]:
-    image = nibabel.load(folder / "truth.nii.gz")
+    image: Any = nibabel.load(folder / "truth.nii.gz")
     truth = np.asarray(image.dataobj)
     if not (out / "volume.nii.gz").is_file():
         return truth, None, ""
-    found = nibabel.load(out / "volume.nii.gz")
+    found: Any = nibabel.load(out / "volume.nii.gz")
     predicted = np.asarray(found.dataobj)
     same = predicted.shape == truth.shape
     if not same or np.abs(found.affine - image.affine).max() > AFFINE_TOLERANCE_MM:

@@ -11,6 +11,7 @@ than after a fixed number.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -205,7 +206,7 @@ def _fit(
         if losses[-1] <= min(losses):
             best = occupancy.detach().numpy().copy()
         if on_step is not None:
-            on_step(step, losses[-1], lambda now=best: _filled(grid, voxels, now))
+            on_step(step, losses[-1], functools.partial(_filled, grid, voxels, best))
         if _converged(losses, options):
             break
         adam.zero_grad()

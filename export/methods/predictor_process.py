@@ -35,7 +35,7 @@ def peak_mib(model: Path, feed: Mapping[str, Array]) -> float:
     """
     with tempfile.TemporaryDirectory(prefix="gcar-feed-") as folder:
         file = Path(folder) / "feed.npz"
-        np.savez(file, **dict(feed))
+        np.savez(file, **dict(feed))  # type: ignore[arg-type]
         done = subprocess.run(  # noqa: S603 - our own module, no shell
             [sys.executable, "-m", "gcar_export.methods.predictor_process", str(model), str(file)],
             capture_output=True, text=True, check=True, timeout=600,

@@ -25,7 +25,7 @@ _TOLERANCE = 1e-6
 
 def rtk() -> Any:
     """Import and return ``itk.RTK`` (some seconds the first time)."""
-    from itk import RTK  # type: ignore[import-untyped]
+    from itk import RTK
 
     return RTK
 
@@ -47,7 +47,7 @@ def geometry(carms: Sequence[CArm]) -> Any:
         If the views differ in rows, columns or pixel aspect ratio.
     """
     _same_detector(carms)
-    import itk  # type: ignore[import-untyped]
+    import itk
 
     out = rtk().ThreeDCircularProjectionGeometry.New()
     spacing = _spacing(carms)

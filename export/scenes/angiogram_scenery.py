@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from scipy import ndimage
@@ -20,7 +22,7 @@ def scenery(
     ground = _subtracted if rng.random() < 0.25 else _patient
     out = ground(rng, side)
     devices = _devices(rng, side, pixel_mm, wires)
-    return out, cv2.GaussianBlur(devices, (0, 0), 0.7)
+    return out, np.asarray(cv2.GaussianBlur(devices, (0, 0), 0.7))
 
 
 def _subtracted(rng: np.random.Generator, side: int) -> Image:
@@ -92,15 +94,15 @@ def _devices(rng: np.random.Generator, side: int, pixel_mm: float, wires: float)
     return out
 
 
-def _stroke(out: Image, corners: list, width_px: float, strength: float) -> None:
+def _stroke(out: Image, corners: Sequence[Array], width_px: float, strength: float) -> None:
     """Draw a smooth curve of even width through (col, row) corners."""
-    corners = np.asarray(corners, float)
-    t = np.linspace(0, len(corners) - 1, 200)
-    line = np.stack([np.interp(t, np.arange(len(corners)), c) for c in corners.T], 1)
+    points = np.asarray(corners, float)
+    t = np.linspace(0, len(points) - 1, 200)
+    line = np.stack([np.interp(t, np.arange(len(points)), c) for c in points.T], 1)
     line = ndimage.gaussian_filter1d(line, 18, axis=0, mode="nearest")
     canvas = np.zeros_like(out)
-    points, width = np.rint(line * 16).astype(np.int32), max(1, round(width_px))
-    cv2.polylines(canvas, [points], False, 1.0, width, cv2.LINE_AA, 4)
+    fixed, width = np.rint(line * 16).astype(np.int32), max(1, round(width_px))
+    cv2.polylines(canvas, [fixed], False, 1.0, width, cv2.LINE_AA, 4)
     out += np.float32(strength) * canvas
 
 
@@ -114,7 +116,7 @@ def moved(rng: np.random.Generator, picture: Image) -> Image:
     half = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
     first, last = (tuple(int(x) for x in np.rint(16 * (4 + s * half))) for s in (-1, 1))
     cv2.line(kernel, first, last, 1.0, 1, cv2.LINE_AA, 4)
-    return cv2.filter2D(picture, -1, kernel / kernel.sum())
+    return np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum()))
 
 
 def exposed(rng: np.random.Generator, absorbed: Image) -> tuple[Image, Mask]:

@@ -60,7 +60,7 @@ def random_vessels(
     doubtful = cv2.remap(thin, *wave, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     step = start[-1] - start[0]
     return Vessels(
-        path_px=bent,
+        path_px=np.asarray(bent),
         doubtful=doubtful > 0.1,
         ostium=start[0],
         heading=step / max(float(np.hypot(*step)), 1e-9),
@@ -209,7 +209,7 @@ def catheter(rng: np.random.Generator, vessels: Vessels, pixel_mm: float) -> Ima
         ribbon(out, other, 0.9 * width, 0.9 * width * rng.uniform(*LUMEN_SHARE))
     if rng.random() < 0.35:
         out += _spill(rng, side, tip + back * rng.uniform(0, 8) * mm, pixel_mm)
-    return cv2.GaussianBlur(out, (0, 0), 0.6)
+    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.6))
 
 
 def _bezier(corners: Array) -> Array:

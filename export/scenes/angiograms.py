@@ -71,7 +71,9 @@ def generated_angiogram(seed: int, index: int, lenient: bool = False) -> Generat
     filled = np.maximum(path_px, tube)
     contrast = float(np.exp(rng.uniform(np.log(0.025), np.log(0.16))))
     patient, devices = scenery(rng, SIDE, pixel_mm, LENIENT_WIRES if lenient else WIRES)
-    absorbed = contrast * pixel_mm * filled + cv2.GaussianBlur(patient, (0, 0), 0.7) + devices
+    absorbed: Array = (
+        contrast * pixel_mm * filled + cv2.GaussianBlur(patient, (0, 0), 0.7) + devices
+    )
     pixels, field = exposed(rng, absorbed)
     seen = contrast * pixel_mm * path_px > FAINT
     mask = (path_px > SURE_PX) & ~vessels.doubtful & seen

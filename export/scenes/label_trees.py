@@ -105,7 +105,7 @@ def _resampled(label: LabelVolume) -> LabelVolume:
     shape = np.maximum(np.ceil(np.asarray(label.grid.size_mm) / VOXEL_MM), 1).astype(int)
     size = shape * VOXEL_MM
     grid = Grid(
-        center_mm=tuple(label.grid.center_mm),
+        center_mm=label.grid.center_mm,
         size_mm=(float(size[0]), float(size[1]), float(size[2])),
         shape=(int(shape[0]), int(shape[1]), int(shape[2])),
     )

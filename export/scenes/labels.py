@@ -11,6 +11,7 @@ import dataclasses
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
@@ -155,10 +156,11 @@ class LabelVolume:
 
     def _on(self, occupancy: Array, lower_mm: Array) -> LabelVolume:
         size = np.asarray(occupancy.shape) * self.grid.spacing_mm
+        x, y, z = occupancy.shape
         grid = Grid(
             center_mm=tuple((lower_mm + 0.5 * size).tolist()),
             size_mm=tuple(size.tolist()),
-            shape=tuple(int(n) for n in occupancy.shape),
+            shape=(x, y, z),
         )
         return dataclasses.replace(self, occupancy=np.ascontiguousarray(occupancy), grid=grid)
 
@@ -230,11 +232,8 @@ def from_array(occupancy: Array, index2ras: Array, name: str = "label") -> Label
     spacing = spacing[order]
     size = spacing * array.shape
     center = corner - 0.5 * spacing + 0.5 * size
-    grid = Grid(
-        center_mm=tuple(center.tolist()),
-        size_mm=tuple(size.tolist()),
-        shape=tuple(int(n) for n in array.shape),
-    )
+    x, y, z = array.shape
+    grid = Grid(center_mm=tuple(center.tolist()), size_mm=tuple(size.tolist()), shape=(x, y, z))
     return LabelVolume(occupancy=np.ascontiguousarray(array), grid=grid, name=name)
 
 
@@ -242,7 +241,7 @@ def _read_any(path: Path, name: str) -> tuple[Array, Array]:
     if name.endswith((".nii", ".nii.gz")):
         import nibabel
 
-        image = nibabel.load(path)
+        image: Any = nibabel.load(path)
         return np.asarray(image.dataobj), np.asarray(image.affine)
     if name.endswith((".nrrd", ".nhdr")):
         return read_nrrd(path)

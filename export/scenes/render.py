@@ -13,7 +13,7 @@ from gcar_deploy.geometry.carm import CArm
 
 
 @numba.njit(cache=True)
-def _capsule_interval(ox, oy, oz, dx, dy, dz, a, b, r):
+def _capsule_interval(ox, oy, oz, dx, dy, dz, a, b, r):  # type: ignore[no-untyped-def]
     """Return entry and exit (entry > exit: none) of a unit ray and the capsule (a, b, r)."""
     t_in, t_out = 1e30, -1e30
     for k in range(2):
@@ -63,7 +63,7 @@ def _capsule_interval(ox, oy, oz, dx, dy, dz, a, b, r):
 
 
 @numba.njit(cache=True)
-def _collect(a, b, r, boxes, source, inverse, cols, fill, pixel, t0, t1):
+def _collect(a, b, r, boxes, source, inverse, cols, fill, pixel, t0, t1):  # type: ignore[no-untyped-def]
     n = 0
     for i in range(len(r)):
         for row in range(boxes[i, 2], boxes[i, 3] + 1):
@@ -85,7 +85,7 @@ def _collect(a, b, r, boxes, source, inverse, cols, fill, pixel, t0, t1):
 
 
 @numba.njit(cache=True)
-def _union(order, pixel, t0, t1, image):
+def _union(order, pixel, t0, t1, image):  # type: ignore[no-untyped-def]
     current, end = -1, 0.0
     for k in range(len(order)):
         i = order[k]
@@ -98,7 +98,7 @@ def _union(order, pixel, t0, t1, image):
 
 
 @numba.njit(cache=True)
-def _longest(order, pixel, t0, t1, image, middle):
+def _longest(order, pixel, t0, t1, image, middle):  # type: ignore[no-untyped-def]
     """Sum stretches into ``image`` and put the middle of the longest one into ``middle``."""
     current, start, end, best = -1, 0.0, -1e30, 0.0
     for k in range(len(order) + 1):
@@ -157,7 +157,9 @@ def path_and_depth(
     return image.reshape(shape).astype(np.float32), middle.reshape(shape)
 
 
-def _intervals(carm, starts, ends, radii):
+def _intervals(
+    carm: CArm, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixel, entry and exit (mm from the source) of every meeting of a ray and a capsule."""
     boxes = _boxes(carm, starts, ends, radii)
     inside = (boxes[:, 0] <= boxes[:, 1]) & (boxes[:, 2] <= boxes[:, 3])
@@ -173,7 +175,7 @@ def _intervals(carm, starts, ends, radii):
     return pixel, t0, t1
 
 
-def _boxes(carm, starts, ends, radii):
+def _boxes(carm: CArm, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray) -> np.ndarray:
     (pa, za), (pb, zb) = carm.project(starts), carm.project(ends)
     reach = radii * max(carm.focal_px) / np.maximum(np.minimum(za, zb) - radii, 1.0) * 1.05 + 1
     low = np.ceil(np.minimum(pa, pb) - reach[:, None])
@@ -190,7 +192,7 @@ def _boxes(carm, starts, ends, radii):
 
 
 @numba.njit(cache=True)
-def _occupancy(points, half, sub, a, b, r, head, items, low, cell, dims, out, off, rad, reach):
+def _occupancy(points, half, sub, a, b, r, head, items, low, cell, dims, out, off, rad, reach):  # type: ignore[no-untyped-def]
     offsets = (np.arange(sub) + 0.5) / sub * 2 - 1
     for i in range(len(points)):
         p = points[i]
@@ -239,7 +241,10 @@ def _occupancy(points, half, sub, a, b, r, head, items, low, cell, dims, out, of
             rad[i] = np.nan
 
 
-def occupancy(points, voxel_mm, starts, ends, radii, *, sub=4, reach_mm=4.0):
+def occupancy(
+    points: np.ndarray, voxel_mm: float, starts: np.ndarray, ends: np.ndarray, radii: np.ndarray,
+    *, sub: int = 4, reach_mm: float = 4.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Area-averaged occupancy of voxels, and where the centreline lies.
 
     Parameters
@@ -287,7 +292,7 @@ def occupancy(points, voxel_mm, starts, ends, radii, *, sub=4, reach_mm=4.0):
 
 
 @numba.njit(cache=True)
-def _bucket(a, b, reach, low, cell, dims):
+def _bucket(a, b, reach, low, cell, dims):  # type: ignore[no-untyped-def]
     n_cells = dims[0] * dims[1] * dims[2]
     head = np.zeros(n_cells + 1, np.int64)
     items = np.empty(0, np.int64)

@@ -91,7 +91,7 @@ def thinned_label(path: Path, side: str) -> Tree:
     grid = Grid(
         center_mm=label.grid.center_mm,
         size_mm=tuple((shape * LABEL_VOXEL_MM).tolist()),
-        shape=tuple(int(n) for n in shape),
+        shape=(int(shape[0]), int(shape[1]), int(shape[2])),
     )
     volume = label.on_grid(grid)
     index = np.argwhere(volume > 0)

@@ -14,6 +14,8 @@ axis and size, and a smooth warp. Radii 0.4 .. 2.8 mm.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -111,7 +113,7 @@ def _random_heart(rng: np.random.Generator) -> _Heart:
     )
 
 
-def _random_warp(rng: np.random.Generator):
+def _random_warp(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     """Draw a sum of three long waves, up to a few millimetres each."""
     waves = rng.normal(size=(3, 3)) * rng.uniform(0.03, 0.09, size=(3, 1))
     phases = rng.uniform(0, 2 * np.pi, size=3)
@@ -126,7 +128,9 @@ def _random_warp(rng: np.random.Generator):
 # -- vessels ------------------------------------------------------------------------------
 
 
-def _left_tree(rng, heart, dominance, calibre):
+def _left_tree(
+    rng: np.random.Generator, heart: _Heart, dominance: str, calibre: float
+) -> list[Vessel]:
     fork_phi, fork_s = rng.uniform(5, 35), rng.uniform(-0.10, 0.04)
     r_lm = calibre * rng.uniform(1.9, 2.6)
     inner = rng.uniform(6, 20)
@@ -199,7 +203,9 @@ def _left_tree(rng, heart, dominance, calibre):
     return out
 
 
-def _right_tree(rng, heart, dominance, calibre):
+def _right_tree(
+    rng: np.random.Generator, heart: _Heart, dominance: str, calibre: float
+) -> list[Vessel]:
     phi0 = -rng.uniform(25, 60)
     r = calibre * rng.uniform(1.5, 2.5) * (0.7 if dominance == "left" else 1.0)
     ostium = heart.surface(
@@ -240,7 +246,10 @@ def _right_tree(rng, heart, dominance, calibre):
     return out
 
 
-def _posterior(rng, heart, side, parent, *, pda=True, many=True):
+def _posterior(
+    rng: np.random.Generator, heart: _Heart, side: str, parent: Vessel, *, pda: bool = True,
+    many: bool = True,
+) -> list[Vessel]:  # fmt: skip
     """PDA in the posterior groove and posterolateral branches, from the end of ``parent``."""
     out = []
     start, r_end = parent.points_mm[-1], float(parent.radius_mm[-1])
@@ -270,7 +279,10 @@ def _posterior(rng, heart, side, parent, *, pda=True, many=True):
     return out
 
 
-def _side_branch(rng, heart, name, side, parent, where, sign, reach):
+def _side_branch(
+    rng: np.random.Generator, heart: _Heart, name: str, side: str, parent: Vessel,
+    where: tuple[float, float], sign: float, reach: tuple[float, float],
+) -> list[Vessel]:  # fmt: skip
     i = int(np.clip(rng.uniform(*where) * len(parent.points_mm), 1, len(parent.points_mm) - 3))
     start = parent.points_mm[i]
     local = start @ heart.axes.T
@@ -292,7 +304,7 @@ def _side_branch(rng, heart, name, side, parent, where, sign, reach):
     return out
 
 
-def _septal(rng, heart, name, parent):
+def _septal(rng: np.random.Generator, heart: _Heart, name: str, parent: Vessel) -> list[Vessel]:
     i = int(np.clip(rng.uniform(0.08, 0.6) * len(parent.points_mm), 1, len(parent.points_mm) - 3))
     start = parent.points_mm[i]
     inward = -heart.axes[0] + 0.5 * heart.axes[2] + 0.25 * rng.normal(size=3)
@@ -311,7 +323,10 @@ def _septal(rng, heart, name, parent):
 # -- curves and calibres --------------------------------------------------------------------
 
 
-def _surface_curve(rng, heart, way, *, start, cut, lift=0.0):
+def _surface_curve(
+    rng: np.random.Generator, heart: _Heart, way: Any, *, start: np.ndarray, cut: float,
+    lift: float = 0.0,
+) -> np.ndarray:  # fmt: skip
     from scipy.interpolate import PchipInterpolator
 
     way = np.asarray(way, dtype=np.float64)
@@ -327,14 +342,14 @@ def _surface_curve(rng, heart, way, *, start, cut, lift=0.0):
     return _tortuous(rng, points)
 
 
-def _free_curve(rng, ends, bow):
+def _free_curve(rng: np.random.Generator, ends: Sequence[np.ndarray], bow: float) -> np.ndarray:
     a, b = np.asarray(ends[0]), np.asarray(ends[1])
     n = max(6, int(np.linalg.norm(b - a) / STEP_MM))
     t = np.linspace(0, 1, n)[:, None]
     return _resample(a + t * (b - a) + np.sin(np.pi * t) * rng.normal(size=3) * bow)
 
 
-def _tortuous(rng, points):
+def _tortuous(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
     """Add smooth noise along the curve (correlation 5 .. 20 mm) that is zero at its start."""
     n = len(points)
     arc = np.arange(n) * STEP_MM
@@ -353,19 +368,21 @@ def _tortuous(rng, points):
     return _resample(points + fade[:, None] * (wiggle - wiggle[0]))
 
 
-def _vessel(name, side, points, r_start, r_end):
+def _vessel(
+    name: str, side: str, points: np.ndarray, r_start: float, r_end: float | None
+) -> Vessel:
     if r_end is None:
         r_end = r_start * 0.7
     t = np.linspace(0, 1, len(points))
     return Vessel(name, side, points, r_start + (r_end - r_start) * t**0.8)
 
 
-def _daughter(rng, r_parent, low, high):
+def _daughter(rng: np.random.Generator, r_parent: float, low: float, high: float) -> float:
     """Radius of a daughter that carries a share of the parent's flow (Murray's law)."""
     return float(r_parent * rng.uniform(low, high) ** (1 / MURRAY))
 
 
-def _texture_radius(rng, vessel, floor):
+def _texture_radius(rng: np.random.Generator, vessel: Vessel, floor: float) -> np.ndarray:
     n = len(vessel.radius_mm)
     arc = np.arange(n) * STEP_MM
     radius = np.maximum(vessel.radius_mm, floor * rng.uniform(0.8, 1.12))
@@ -381,7 +398,7 @@ def _texture_radius(rng, vessel, floor):
     return np.clip(radius, 0.4, 3.4)
 
 
-def _resample(points):
+def _resample(points: np.ndarray) -> np.ndarray:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     n = max(4, int(arc[-1] / STEP_MM) + 1)

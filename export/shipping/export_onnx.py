@@ -41,7 +41,10 @@ class DeployedSparse(torch.nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(self, features, ray, ray_path, weight, *tables):
+    def forward(
+        self, features: torch.Tensor, ray: torch.Tensor, ray_path: torch.Tensor,
+        weight: torch.Tensor, *tables: torch.Tensor,
+    ) -> torch.Tensor:  # fmt: skip
         """Arrays as ``flat_inputs`` orders them, to (n, 5)."""
         neighbours, parent = tables[: LEVELS + 1], tables[LEVELS + 1 : 2 * LEVELS + 1]
         members, children = tables[2 * LEVELS + 1], tables[2 * LEVELS + 2 :]
@@ -72,13 +75,13 @@ def load_checkpoint(path: Path) -> SparsePredictor | UNetPredictor:
     return net.eval()
 
 
-def deployed(checkpoint: Path) -> torch.nn.Module:
+def deployed(checkpoint: Path) -> DeployedSparse | UNetPredictor:
     """Return the network with the inputs and outputs of its ONNX graph."""
     net = load_checkpoint(checkpoint)
     return (DeployedSparse(net) if isinstance(net, SparsePredictor) else net).eval()
 
 
-def graph_inputs(net: torch.nn.Module) -> list[str]:
+def graph_inputs(net: DeployedSparse | UNetPredictor) -> list[str]:
     """Names of the graph's inputs."""
     if isinstance(net, DeployedSparse):
         return input_names()
@@ -138,7 +141,9 @@ def _trace_unet(net: UNetPredictor) -> Any:
     )  # fmt: skip
 
 
-def _spec(net: torch.nn.Module, manifest: dict[str, Any], name: str) -> dict[str, Any]:
+def _spec(
+    net: DeployedSparse | UNetPredictor, manifest: dict[str, Any], name: str
+) -> dict[str, Any]:
     labels = manifest.get("labels")
     spec: dict[str, Any] = {
         "schema": "gcar-model/1",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,7 +89,7 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
     net = _Deployed(load_segmenter_checkpoint(checkpoint)).eval()
     example = torch.zeros(1, INPUT["channels"], 8 * STRIDE, 9 * STRIDE)
     rows, cols = (torch.export.Dim(n, min=2, max=512) for n in ("rows", "cols"))
-    program = torch.onnx.export(
+    program: Any = torch.onnx.export(
         net,
         (example,),
         dynamo=True,

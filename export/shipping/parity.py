@@ -24,7 +24,7 @@ from gcar_export.shipping.export_onnx import (
 from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.task_check import task_measure, torch_predictor
 from gcar_export.training.dataset import training_scene
-from gcar_export.training.networks.unet import UNetConfig
+from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.single_dataset import training_pictures
 
 #: largest difference between torch and ONNX Runtime, as a share of the output's range
@@ -77,7 +77,7 @@ def parity(checkpoint: Path, model: Path, inputs: int) -> Parity:
     return Parity(count, worst, equal / max(total, 1))
 
 
-def _inputs(net: torch.nn.Module, count: int) -> Iterator[list[Array]]:
+def _inputs(net: DeployedSparse | UNetPredictor, count: int) -> Iterator[list[Array]]:
     """Extreme inputs first, then generated ones."""
     if isinstance(net, DeployedSparse):
         scene = training_scene(SEED, 0).encoded

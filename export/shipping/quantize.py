@@ -76,7 +76,7 @@ def quantize(path: Path, out: Path, calibration: int = 16) -> ModelFile:
         quiet = logging.getLogger().level
         try:
             quantize_static(
-                str(prepared), str(out), reader,  # type: ignore[arg-type]
+                str(prepared), str(out), reader,
                 op_types_to_quantize=["Conv", "MatMul", "Gemm"],
                 activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, per_channel=True,
             )  # fmt: skip

@@ -54,7 +54,7 @@ def closure(names: list[str]) -> dict[str, metadata.Distribution]:
 
 def licence(distribution: metadata.Distribution) -> str:
     """Licence as the distribution states it: SPDX expression, classifier, or its own words."""
-    head = distribution.metadata
+    head: Any = distribution.metadata  # an email.message.Message, which the stubs do not say
     stated = head.get("License-Expression")
     if stated:
         return str(stated)

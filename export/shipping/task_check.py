@@ -25,8 +25,9 @@ from gcar_deploy.predict.decision import decide
 from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.types import Scalars
-from gcar_export.shipping.export_onnx import deployed, graph_inputs
+from gcar_export.shipping.export_onnx import DeployedSparse, deployed, graph_inputs
 from gcar_export.training.dataset import TrainingScene, training_scene
+from gcar_export.training.networks.unet import UNetPredictor
 
 #: seed of the scenes; neither training nor validation draws from it
 SEED = 80_001
@@ -66,7 +67,7 @@ def confidences(predictor: Predictor, scene: TrainingScene) -> Scalars:
 class _TorchSession:
     """Answers as an ONNX Runtime session would, with torch."""
 
-    def __init__(self, net: torch.nn.Module) -> None:
+    def __init__(self, net: DeployedSparse | UNetPredictor) -> None:
         self.net, self.names = net, graph_inputs(net)
 
     def run(self, _names: Any, feed: dict[str, Any], _options: Any = None) -> list[Any]:

@@ -15,7 +15,7 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.predict.center_map import net_picture
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor, open_predictor
 from gcar_deploy.predict.centers import Seen
-from gcar_deploy.predict.encoding import flat_inputs
+from gcar_deploy.predict.encoding import flat_inputs, input_names
 from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
 from gcar_deploy.types import Array
 from gcar_export.evaluate.evaluate import find_labels
@@ -170,7 +170,7 @@ def _feed(predictor: Predictor, posed: Seen) -> dict[str, Array]:
         picture = net_picture(carm, path, int(predictor.model.inputs["pixels"]))
         arrays = [picture.network_input(), picture.axes_input()]
         return dict(zip(predictor.input_names(), arrays, strict=False))
-    return dict(zip(predictor.input_names(), flat_inputs(posed.encoded), strict=True))
+    return dict(zip(input_names(), flat_inputs(posed.encoded), strict=True))
 
 
 def table(rows: Sequence[Row], costs: Sequence[Cost], protocol: str) -> str:

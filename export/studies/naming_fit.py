@@ -225,7 +225,7 @@ def main() -> None:
     told = parser.parse_args()
     made = examples(FIT_SEED, told.trees)
     real = real_cases(told.data)
-    own = {patient: [] for patient, _ in real}
+    own: dict[str, list[Example]] = {patient: [] for patient, _ in real}
     for patient, case in real:
         own[patient] += examples_of(case, patient)
     everything = made + [example for examples_ in own.values() for example in examples_]

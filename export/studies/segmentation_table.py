@@ -11,8 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -142,7 +143,7 @@ def _print_expert(pairs: Sequence[Path], each: bool, net: Segmenter | None, who:
     if each:
         for picture, scores in rows.items():
             print(_line(picture, scores))
-    halves = {
+    halves: dict[str, tuple[Callable[[list[float]], Any], dict[str, dict[str, float]]]] = {
         "mean": (np.mean, rows),
         "mean, odd numbers (options were chosen with them)": (np.mean, _numbered(rows, 1)),
         "mean, even numbers": (np.mean, _numbered(rows, 0)),

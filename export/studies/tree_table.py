@@ -92,7 +92,7 @@ def real_statistics(path: Path) -> dict[str, float]:
     spacing = np.asarray(label.grid.spacing_mm)
     shape = np.maximum(np.round(spacing * label.grid.shape / VOXEL_MM), 1).astype(int)
     grid = Grid(
-        center_mm=tuple(label.grid.center_mm),
+        center_mm=label.grid.center_mm,
         size_mm=tuple((shape * VOXEL_MM).tolist()),
         shape=tuple(shape.tolist()),
     )

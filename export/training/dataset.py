@@ -16,6 +16,7 @@ from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_deploy.predict.hull import Candidates, visual_hull
+from gcar_deploy.types import Array
 from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.scenes.trees import random_tree
 
@@ -135,7 +136,7 @@ def examination(
     return Examination(tree, carms, h, shape, paper)
 
 
-def _generated(rng, paper):
+def _generated(rng: np.random.Generator, paper: bool) -> Capsules:
     tree = random_tree(rng)
     if not paper:
         tree = (
@@ -144,7 +145,7 @@ def _generated(rng, paper):
     return Capsules(*tree.segments())
 
 
-def _label_tree(rng, labels, paper):
+def _label_tree(rng: np.random.Generator, labels: Sequence[LabelTree], paper: bool) -> Capsules:
     label = labels[int(rng.integers(len(labels)))]
     if paper or not label.sides or rng.random() > 0.8:
         return label.whole
@@ -189,7 +190,7 @@ def _draw(
     )
 
 
-def _paper_views(rng, n):
+def _paper_views(rng: np.random.Generator, n: int) -> tuple[list[CArm], float, int]:
     h = rng.uniform(1.25, 1.5)
     start = rng.uniform(-180, 90) if rng.random() < 0.5 else 0.0
     step = 180.0 / n
@@ -211,7 +212,7 @@ def _paper_views(rng, n):
     )
 
 
-def _clinical_views(rng, n):
+def _clinical_views(rng: np.random.Generator, n: int) -> tuple[list[CArm], float, int]:
     h = rng.uniform(0.85, 1.25)
     while True:
         carms = []
@@ -234,10 +235,10 @@ def _clinical_views(rng, n):
             return carms, h, 128
 
 
-def _turned_to_usual(rng, carms, paper):
+def _turned_to_usual(rng: np.random.Generator, carms: Sequence[CArm], paper: bool) -> list[CArm]:
     """Keep distances and sizes, take the directions from ``USUAL_VIEWS``."""
     if paper:
-        chosen = PAPER_VIEWS
+        chosen = list(PAPER_VIEWS)
     else:
         chosen = [USUAL_VIEWS[k] for k in rng.permutation(len(USUAL_VIEWS))[: len(carms)]]
     out = []
@@ -270,7 +271,7 @@ def degrade(rng: np.random.Generator, path: np.ndarray, h: float) -> np.ndarray:
         width = 2 * cv2.distanceTransform(mask, cv2.DIST_L2, 3) * h
         out = out * (1 - (w := rng.uniform(0, 1))) + w * np.maximum(width - 0.5 * h, 0)
     out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.2, 0.9))
-    noise = cv2.GaussianBlur(
+    noise: Array = cv2.GaussianBlur(
         rng.normal(size=path.shape).astype(np.float32), (0, 0), rng.uniform(0.5, 6)
     )
     noise *= rng.uniform(0, 0.3) / max(float(noise.std()), 1e-6)

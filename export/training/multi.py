@@ -277,13 +277,13 @@ def _any(flag: bool, replicas: int) -> bool:
     return bool(shared > 0)
 
 
-def _average(net, replicas: int) -> None:
+def _average(net: torch.nn.Module, replicas: int) -> None:
     if replicas == 1:
         return
-    flat = torch.cat([p.grad.reshape(-1) for p in net.parameters()])
+    flat = torch.cat([p.grad.reshape(-1) for p in net.parameters()])  # type: ignore[union-attr]
     torch.distributed.all_reduce(flat)
     flat /= replicas
     at = 0
     for p in net.parameters():
-        p.grad.copy_(flat[at : at + p.numel()].view_as(p))
+        p.grad.copy_(flat[at : at + p.numel()].view_as(p))  # type: ignore[union-attr]
         at += p.numel()

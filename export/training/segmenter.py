@@ -14,7 +14,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
@@ -198,7 +198,10 @@ def _resume(out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer) -> int:
     return int(data["step"])
 
 
-def _checkpoint(out, net, optimiser, step, options, losses, dice) -> None:
+def _checkpoint(
+    out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer, step: int,
+    options: SegmenterOptions, losses: Sequence[float], dice: float | None,
+) -> None:  # fmt: skip
     data = {f"net.{k}": v.detach().clone().contiguous() for k, v in net.state_dict().items()}
     for name, p in net.named_parameters():
         for key, value in optimiser.state.get(p, {}).items():

@@ -106,7 +106,7 @@ class Batch:
     axes: torch.Tensor
 
     @staticmethod
-    def of(drawn: Sequence[TrainingPicture], alpha: int, device: str) -> Batch:
+    def of(drawn: Sequence[TrainingPicture], alpha: int, device: str | torch.device) -> Batch:
         """Stack pictures and their truth."""
 
         def stack(arrays: Sequence[Any], kind: Any = np.float32) -> torch.Tensor:
@@ -218,7 +218,9 @@ def train(
     scenes = SceneOptions()
     run = RunFolder(out, _manifest(options, config, scenes, label_hashes or {}))
     torch.manual_seed(options.seed)
-    net = UNetPredictor(config).to(options.device, memory_format=torch.channels_last).train()
+    net = UNetPredictor(config).to(options.device)
+    # The stubs do not know this keyword of a module.
+    net = net.to(memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
@@ -273,7 +275,10 @@ def _precision(options: SingleOptions) -> contextlib.AbstractContextManager[Any]
     return torch.autocast(kind, torch.bfloat16, enabled=options.bf16)
 
 
-def _manifest(options, config, scenes, label_hashes) -> dict[str, Any]:
+def _manifest(
+    options: SingleOptions, config: UNetConfig, scenes: SceneOptions,
+    label_hashes: Mapping[str, str],
+) -> dict[str, Any]:  # fmt: skip
     return {
         "network": "unet",
         "config": dataclasses.asdict(config),

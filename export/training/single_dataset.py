@@ -19,6 +19,7 @@ from gcar_deploy.predict.center_map import (
     encode_depth,
     net_picture,
 )
+from gcar_deploy.types import Array
 from gcar_export.scenes.render import path_and_depth
 from gcar_export.training.dataset import LabelTree, SceneOptions, degrade, examination, picture
 from gcar_export.training.networks.unet import UNetConfig
@@ -81,7 +82,7 @@ def training_pictures(
     raise RuntimeError(f"no usable pictures for seed {seed}, index {i}")
 
 
-def _targets(seen, true_path, ray_mm, alpha):
+def _targets(seen: NetPicture, true_path: Array, ray_mm: Array, alpha: int) -> tuple[Array, Array]:
     """Depth of each cell's best pixel, and which cells have one."""
     path = blocks(true_path, alpha)
     best = path.argmax(axis=2)[:, :, None]
@@ -92,7 +93,7 @@ def _targets(seen, true_path, ray_mm, alpha):
     return np.clip(depth, 0.0, 1.0).astype(np.float32), known
 
 
-def _visible(seen, points):
+def _visible(seen: NetPicture, points: Array) -> Array:
     pixels, depth = seen.carm.project(points)
     n = seen.carm.rows
     inside = (pixels > -0.5).all(axis=1) & (pixels < n - 0.5).all(axis=1) & (depth > 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from gcar_deploy.errors import UsageError
 from gcar_export.training.dataset import LabelTree
@@ -48,7 +49,9 @@ def start(
         from gcar_export.scenes.label_trees import read_label_trees
 
         trees, hashes = read_label_trees(labels)
-    changes = {k: v for k, v in (("steps", steps), ("decay_steps", decay_steps)) if v}
+    changes: dict[str, Any] = {
+        k: v for k, v in (("steps", steps), ("decay_steps", decay_steps)) if v
+    }
     until = minutes * 60 if minutes else None
     if network == "multi":
         options = dataclasses.replace(train_multi.PRESETS[preset], **changes)

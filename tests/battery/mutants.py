@@ -6,6 +6,7 @@ import dataclasses
 
 _CARM, _PROJECT = "tests/geometry/test_carm.py", "tests/gaussians/test_project.py"
 _FOLDER = "tests/output/test_folder.py"
+_SIGMA, _MODEL = "tests/tubes/test_uncertainty.py", "tests/tubes/test_oracle.py"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,5 +196,89 @@ MUTANTS = (
         "not hmac.compare_digest(given, expected)",
         "not given and expected",
         ("tests/worker/test_http.py",),
+    ),
+    Mutant(
+        "sigma: half of what a result states",
+        "gcar_deploy/tubes/fit.py",
+        "sigma = np.sqrt(own**2 + geometry**2 + pixel**2)",
+        "sigma = 0.5 * np.sqrt(own**2 + geometry**2 + pixel**2)",
+        (f"{_SIGMA}::test_errors_of_whole_fits_are_those_that_sigma_states",),
+    ),
+    Mutant(
+        "sigma: half of the fit's part",
+        "gcar_deploy/tubes/uncertainty.py",
+        "sigma = np.sqrt(np.maximum(largest, 0.0) * CORRELATED_PIXELS)",
+        "sigma = 0.5 * np.sqrt(np.maximum(largest, 0.0) * CORRELATED_PIXELS)",
+        (f"{_SIGMA}::test_fit_sigma_is_the_cramer_rao_bound_of_a_rigid_tube",),
+    ),
+    Mutant(
+        "sigma: half of the geometry's part",
+        "gcar_deploy/tubes/uncertainty.py",
+        "return np.sqrt(total)",
+        "return 0.5 * np.sqrt(total)",
+        (_SIGMA,),
+    ),
+    Mutant(
+        "sigma: half of it in the table of the centreline",
+        "gcar_deploy/output/tables.py",
+        "branch.radius_mm, branch.sigma_mm, branch.confidence]",
+        "branch.radius_mm, 0.5 * branch.sigma_mm, branch.confidence]",
+        ("tests/output/test_tables.py", "tests/output/test_files.py"),
+    ),
+    Mutant(
+        "rays: a point counts for its neighbour's ray",
+        "gcar_deploy/predict/encoding.py",
+        "np.unique(row * cols + col, return_inverse",
+        "np.unique(row * cols + col // 2 * 2, return_inverse",
+        ("tests/predict/test_encoding.py",),
+    ),
+    Mutant(
+        "rays: a pixel belongs to the last vessel of its run, not the nearest",
+        "gcar_deploy/tubes/pairing.py",
+        "best = np.minimum.reduceat(distance2, pairing.first)",
+        "best = np.maximum.reduceat(distance2, pairing.first)",
+        (_MODEL,),
+    ),
+    Mutant(
+        "views: pictures in the wrong order are not noticed",
+        "gcar_deploy/pose/agreement.py",
+        "    return check_order(ids, given, other, calibrated, options.quality)",
+        '    return [], ""',
+        ("tests/hard/test_matrix.py::test_hard_case[16 flips: views swapped]",),
+    ),
+    Mutant(
+        "views: validate does not judge the poses",
+        "gcar_deploy/pose/registration.py",
+        "findings += check_poses(views, moves, options.quality)",
+        "findings += []",
+        ("tests/test_inspection.py::test_three_views_are_placed_as_run_places_them",),
+    ),
+    Mutant(
+        "pictures: what is lost in the noise is a vessel",
+        "gcar_deploy/imaging/extract.py",
+        "if length < options.min_length_mm or too_faint:",
+        "if length < options.min_length_mm:",
+        ("tests/imaging/test_extract.py",),
+    ),
+    Mutant(
+        "models: a missing segmenter is not told",
+        "gcar_deploy/imaging/extract.py",
+        'return segmenter, [] if segmenter or options.segmenter == "net" else [MISSING]',
+        "return segmenter, []",
+        ("tests/models/test_session.py::test_a_missing_network_is_never_silent",),
+    ),
+    Mutant(
+        "tree: branches run from their free end",
+        "gcar_deploy/tree/rooted.py",
+        "if far[b.start] > far[b.end]",
+        "if far[b.start] < far[b.end]",
+        ("tests/tree/test_rooted.py",),
+    ),
+    Mutant(
+        "measures: what is undefined is 0",
+        "gcar_deploy/output/result.py",
+        'reasons[path] = "not finite"\n        return None',
+        "return 0.0",
+        ("tests/output",),
     ),
 )  # fmt: skip

@@ -12,6 +12,8 @@ Views enter through shared weights and symmetric pooling, so any number in any o
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -42,7 +44,9 @@ class _GatherMatmul(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, weight, neighbours):
+    def forward(
+        ctx: Any, x: torch.Tensor, weight: torch.Tensor, neighbours: torch.Tensor
+    ) -> torch.Tensor:
         ctx.save_for_backward(x, weight, neighbours)
         out = x.new_empty(len(neighbours), weight.shape[0])
         transposed = weight.t().contiguous()
@@ -51,7 +55,7 @@ class _GatherMatmul(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad):
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, None]:
         x, weight, neighbours = ctx.saved_tensors
         grad_weight = torch.zeros_like(weight)
         for low, high, gathered in _blocks(x, neighbours):
@@ -64,7 +68,7 @@ class _GatherMatmul(torch.autograd.Function):
         return grad_x, grad_weight, None
 
 
-def _blocks(x, neighbours):
+def _blocks(x: torch.Tensor, neighbours: torch.Tensor) -> Iterator[tuple[int, int, torch.Tensor]]:
     """Yield (low, high, gathered rows): blocks that stay in the cache are several times faster."""
     size = 1024 if x.device.type == "cpu" else 2**18
     c, flat = x.shape[1], neighbours.reshape(-1)
@@ -126,7 +130,10 @@ class RayExchange(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, x, guess, features, ray, ray_path, weight, members=None):
+    def forward(
+        self, x: torch.Tensor, guess: torch.Tensor, features: torch.Tensor, ray: torch.Tensor,
+        ray_path: torch.Tensor, weight: torch.Tensor, members: torch.Tensor | None = None,
+    ) -> torch.Tensor:  # fmt: skip
         """(n, c) with the arrays of ``Encoded`` to (n, c)."""
         v, n = ray.shape
         r = ray_path.shape[1]
@@ -158,7 +165,9 @@ class RayExchange(nn.Module):
         message = self.view(known).reshape(v, n, -1)
         return x + self.out(torch.cat([message.mean(0), message.amax(0)], dim=1))
 
-    def _scattered(self, z, contribution, flat, rays):
+    def _scattered(
+        self, z: torch.Tensor, contribution: torch.Tensor, flat: torch.Tensor, rays: int
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Mean, maximum and account per ray by scatter: for training, sums in single precision."""
         z = z.to(torch.promote_types(z.dtype, torch.float32))
         ones = torch.ones_like(contribution)
@@ -170,7 +179,9 @@ class RayExchange(nn.Module):
         top = lowest.scatter_reduce(0, index, z[:, self.c_ray :], "amax")
         return mean, top, total[:, self.c_ray + 1 :]
 
-    def _gathered(self, alone, contribution, members):
+    def _gathered(
+        self, alone: torch.Tensor, contribution: torch.Tensor, members: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Gather the same three: for deployment, where scatters race between threads."""
         v, r, k = members.shape
         n = alone.shape[0]
@@ -203,18 +214,11 @@ class Level(nn.Module):
         self.head = nn.Sequential(nn.LayerNorm(w[0]), nn.Linear(w[0], 1 + EXTRA_OUTPUTS))
 
     def forward(
-        self,
-        x,
-        guess,
-        features,
-        ray,
-        ray_path,
-        weight,
-        neighbours,
-        parent,
-        members=None,
-        children=None,
-    ):
+        self, x: torch.Tensor, guess: torch.Tensor, features: torch.Tensor, ray: torch.Tensor,
+        ray_path: torch.Tensor, weight: torch.Tensor, neighbours: Sequence[torch.Tensor],
+        parent: Sequence[torch.Tensor], members: torch.Tensor | None = None,
+        children: Sequence[torch.Tensor] | None = None,
+    ) -> torch.Tensor:  # fmt: skip
         """(n, c) with the arrays of ``Encoded`` to (n, c)."""
         x = self.rays_in(x, guess, features, ray, ray_path, weight, members)
         x = self.first(x, neighbours[0])
@@ -260,8 +264,10 @@ class SparsePredictor(nn.Module):
         self.levels = nn.ModuleList([Level(self.config) for _ in range(self.config.stages)])
 
     def forward(
-        self, features, ray, ray_path, weight, neighbours, parent, members=None, children=None
-    ):
+        self, features: torch.Tensor, ray: torch.Tensor, ray_path: torch.Tensor,
+        weight: torch.Tensor, neighbours: Sequence[torch.Tensor], parent: Sequence[torch.Tensor],
+        members: torch.Tensor | None = None, children: Sequence[torch.Tensor] | None = None,
+    ) -> list[torch.Tensor]:  # fmt: skip
         """Return per stage (n, 5): occupancy logit, offset in cells (3), radius in cells."""
         e = self.embed(features)
         x = self.start(torch.cat([e.mean(0), e.amax(0)], dim=1))
