@@ -15,15 +15,17 @@ from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.engine import prepare
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import silent_errors
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
 from gcar_deploy.imaging.net import load_segmenter
-from gcar_deploy.pose import register
+from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, load_predictor, quick_tree
 from gcar_deploy.quality import check_views
+from gcar_deploy.reconstruct import in_own_frame
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.tree import Tree
 
@@ -102,11 +104,14 @@ def inspect_files(
         views, loaded = [], load_segmenter(wanted)
         segmenter, missing = asked_network(angiograms, options.imaging, loaded)
         found.warnings += missing
-        for entry, angiogram in zip(found.views, angiograms, strict=True):
+        landmark_pixels(options.landmarks, carms)  # named as the user numbers the views
+        frame = own_frame(carms, [a.sha256 for a in angiograms])
+        own, asked = in_own_frame(frame, angiograms, options)
+        for k, angiogram in zip(frame.order, own, strict=True):
             view = extract_vessels(angiogram, options.imaging, segmenter)
-            entry["vessel_share"] = float(view.mask.mean())
+            found.views[k]["vessel_share"] = float(view.mask.mean())
             views.append(view)
-        found.warnings += _registered(found, angiograms, views, grid, options)
+        found.warnings += _registered(found, own, views, frame.grid(grid), asked)
     except GcarError as error:
         found.error = error
     return found

@@ -7,10 +7,12 @@ the pictures -> tree, volume -> quality
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.frame import OwnFrame, own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
@@ -72,6 +74,57 @@ def reconstruct(
     landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
     watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
                       used_s=used_s)  # fmt: skip
+    frame = own_frame([a.carm for a in angiograms], [a.sha256 for a in angiograms])
+    seen, asked = in_own_frame(frame, angiograms, options)
+    found = _reconstructed(seen, frame.grid(grid), asked, (predictor, segmenter), watch)
+    return _as_told(found, frame, angiograms, grid, options)
+
+
+def in_own_frame(
+    frame: OwnFrame, angiograms: Sequence[Angiogram], options: RunOptions
+) -> tuple[list[Angiogram], RunOptions]:
+    """Return pictures and landmarks in the scene's own order, the views in its coordinates."""
+    seen = [
+        dataclasses.replace(angiograms[k], carm=frame.carm(angiograms[k].carm)) for k in frame.order
+    ]
+    marks = tuple(tuple(mark[k] for k in frame.order) for mark in options.landmarks)
+    return seen, dataclasses.replace(options, landmarks=marks)
+
+
+def _as_told(
+    found: Result, frame: OwnFrame, angiograms: Sequence[Angiogram], grid: Grid,
+    options: RunOptions,
+) -> Result:  # fmt: skip
+    """Return the result in the coordinates and in the order that the scene was given in."""
+    places = [frame.place(k) for k in range(len(angiograms))]
+    poses = tuple(
+        dataclasses.replace(found.poses[p], partner=frame.order[found.poses[p].partner])
+        for p in places
+    )
+    views = tuple(
+        dataclasses.replace(found.views[p], carm=pose.applied(angiogram.carm))
+        for p, pose, angiogram in zip(places, poses, angiograms, strict=True)
+    )
+    judged = tuple(found.quality.views[p] for p in places)
+    means = found.gaussians.means_mm + frame.origin_mm
+    return dataclasses.replace(
+        found,
+        quality=dataclasses.replace(found.quality, views=judged),
+        tree=found.tree.moved(frame.origin_mm),
+        gaussians=dataclasses.replace(found.gaussians, means_mm=means),
+        grid=grid, angiograms=tuple(angiograms), views=views, poses=poses, options=options,
+    )  # fmt: skip
+
+
+def _reconstructed(
+    angiograms: Sequence[Angiogram],
+    grid: Grid,
+    options: RunOptions,
+    models: tuple[Predictor | None, Segmenter | None],
+    watch: Stopwatch,
+) -> Result:
+    """Reconstruct a scene that stands in its own frame."""
+    predictor, segmenter = models
 
     def tree_of(views: Sequence[VesselImage]) -> Tree:
         return quick_tree(views, grid, predictor, options, watch)

@@ -52,7 +52,7 @@ class Reconstruction:
     grid : Grid
     angiograms : the pictures as they were given
     views : what was found in them, with the geometry that was used (poses applied)
-    poses : correction of each view against the first
+    poses : correction of each view; one of them, by the scene's own order, stays as it was told
     seconds : wall-clock seconds per stage, and ``total``
     counts : whole numbers worth knowing (candidates, Gaussians, steps ...)
     losses : objective after every accepted refinement step

@@ -217,6 +217,61 @@ def test_wrong_calls(case, engine, tmp_path):
         Engine(tmp_path / "none.onnx")
 
 
+@pytest.fixture(scope="module")
+def learned():
+    return Engine(threads=1)
+
+
+def _changed(angiograms, grid, change):
+    """The same scene told in another way; where its tree comes out, and its views' order."""
+    if change == "order":
+        return angiograms[::-1], grid, np.zeros(3)
+    if change == "border":
+        wide = []
+        for a in angiograms:
+            column, row = a.carm.principal_point
+            carm = dataclasses.replace(
+                a.carm, rows=a.carm.rows + 5, columns=a.carm.columns + 3,
+                principal_point_px=(column + 3, row + 5),
+            )  # fmt: skip
+            wide.append(
+                dataclasses.replace(a, carm=carm, pixels=np.pad(a.pixels, ((5, 0), (3, 0))))
+            )
+        return wide, grid, np.zeros(3)
+    shift = np.array(change)
+    moved = [dataclasses.replace(a, carm=a.carm.moved(shift)) for a in angiograms]
+    center = tuple(float(c - s) for c, s in zip(grid.center_mm, shift, strict=True))
+    return moved, dataclasses.replace(grid, center_mm=center), -shift
+
+
+@pytest.mark.req("REQ-36")
+@pytest.mark.parametrize(
+    "change", [(3e-7, -9e-7, 1e-6), (1.37, -2.21, 0.83), "order", "border"], ids=str
+)
+@pytest.mark.parametrize("kind", ["path_length", "mask"])
+def test_the_same_scene_gives_the_same_tree(case, learned, kind, change):
+    angiograms, grid, _ = case
+    if kind == "mask":
+        angiograms = [
+            dataclasses.replace(
+                a, pixels=(a.pixels > 300).astype(np.float32), intensity=Intensity(kind="mask")
+            )
+            for a in angiograms
+        ]
+    angiograms = [dataclasses.replace(a, sha256=str(k)) for k, a in enumerate(angiograms)]
+    told, asked, back = _changed(angiograms, grid, change)
+    base, found = learned.reconstruct(angiograms, grid), learned.reconstruct(told, asked)
+    assert found.quality.status == base.quality.status
+    np.testing.assert_allclose(found.tree.points(), base.tree.points() + back, atol=1e-3)
+    np.testing.assert_allclose(found.volume, base.volume, atol=1e-3)
+    # views and poses come back in the order in which they were told
+    names = [a.view_id for a in told]
+    assert [v.view_id for v in found.views] == names
+    assert [v.view_id for v in found.quality.views] == names
+    for view, angiogram in zip(found.views, told, strict=True):
+        assert view.carm == angiogram.carm  # no pose was needed
+
+
 def test_a_moved_patient_is_noticed(case, engine):
     angiograms, grid, _ = case
     second: CArm = angiograms[1].carm.moved((0.0, 0.0, 3.0))

@@ -241,7 +241,7 @@ def _attempt(pair: Pair, subject: Subject, engine: Engine) -> Attempt:
         result = engine.reconstruct(pair.angiograms, case_geometry("clinical", 2)[1])
     except RefusedError as error:
         return _refused(pair, engine, str(error))
-    views, pose = result.quality.views, result.poses[1]
+    views, pose = result.quality.views, max(result.poses, key=lambda pose: pose.after)
     dsc = shape = None
     if pair.kind != "two trees":
         dsc = volume_dice(subject.truth, result.volume).value

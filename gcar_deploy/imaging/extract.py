@@ -13,6 +13,7 @@ from gcar_deploy.errors import GeometryError, ModelError, RefusedError
 from gcar_deploy.imaging import calibrate, enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.border import cut_out, put_back, shown_box
 from gcar_deploy.imaging.fusion import fused
 from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
@@ -62,10 +63,20 @@ def extract_vessels(
         return _from_path_length(angiogram, options)
     if angiogram.intensity.kind == "mask":
         return _from_mask(angiogram, options)
-    if options.segmenter == "net" and angiogram.mask is None:
+    if angiogram.mask is not None:
+        return _from_grey(angiogram, _grey_values(angiogram, options), options, None)
+    box = shown_box(pixels)
+    return put_back(_seen(cut_out(angiogram, box), options, segmenter), angiogram, box)
+
+
+def _seen(
+    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
+) -> VesselImage:
+    """Find vessels in grey values, by whom the options name."""
+    if options.segmenter == "net":
         segmenter = _needed(segmenter)
     grey = _grey_values(angiogram, options)
-    if segmenter is None or options.segmenter == "classic" or angiogram.mask is not None:
+    if segmenter is None or options.segmenter == "classic":
         return _from_grey(angiogram, grey, options, None)
     if options.segmenter == "net":
         return _from_grey(angiogram, grey, options, segmenter)

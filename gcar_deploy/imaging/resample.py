@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import sparse
@@ -79,9 +80,81 @@ def sampled(view: VesselImage, pixel_mm: float) -> VesselImage:
 
 
 def sampled_path(view: VesselImage, pixel_mm: float) -> tuple[CArm, Image]:
-    """Like ``sampled``, but only the C-arm and the path lengths: no mask, no skeleton."""
-    scale = view.carm.pixel_at_isocenter_mm / pixel_mm
-    if scale >= 1:
-        return view.carm, view.path_mm
-    rows, columns = (max(round(n * scale), 1) for n in view.mask.shape)
-    return view.carm.resized(rows, columns), area_average(view.path_mm, rows, columns)
+    """C-arm and path lengths with pixels of ``pixel_mm`` at the isocentre, never finer."""
+    carm, (path,) = coarsened(
+        view.carm, (view.path_mm,), pixel_mm / view.carm.pixel_at_isocenter_mm
+    )
+    return carm, path
+
+
+def coarsened(
+    carm: CArm, pictures: Sequence[Image], factor: float
+) -> tuple[CArm, tuple[Image, ...]]:
+    """Average pictures over pixels ``factor`` times as large, which meet at the principal point.
+
+    So the pixels belong to the scene, not to the corner of the picture: a border more or less
+    changes nothing. Pixels that reach beyond the picture hold the mean of what is inside.
+
+    Parameters
+    ----------
+    carm : CArm of the pictures
+    pictures : (rows, cols) each
+    factor : 1 or less returns them as they are
+
+    Returns
+    -------
+    carm : CArm of the new pictures
+    pictures : (new rows, new cols) float32 each
+    """
+    if factor <= 1 + 1e-6:
+        return carm, tuple(pictures)
+    column, row = carm.principal_point
+    down, first_row = _cells(carm.rows, row, factor)
+    across, first_column = _cells(carm.columns, column, factor)
+    point = (-first_column - 0.5, -first_row - 0.5)
+    new = _coarser(carm, (down.shape[0], across.shape[0]), factor, point)
+    small = ((across @ (down @ picture).T).T for picture in pictures)
+    return new, tuple(np.ascontiguousarray(image, dtype=np.float32) for image in small)
+
+
+def _coarser(carm: CArm, shape: tuple[int, int], factor: float, point: tuple[float, float]) -> CArm:
+    """View with larger pixels whose principal point is at ``point`` (col, row)."""
+    matrix = None
+    if carm.projection_matrix is not None:
+        old = carm.principal_point
+        S = np.array(
+            [
+                [1 / factor, 0, point[0] - old[0] / factor],
+                [0, 1 / factor, point[1] - old[1] / factor],
+                [0, 0, 1],
+            ]
+        )
+        matrix = tuple(map(tuple, (S @ np.asarray(carm.projection_matrix)).tolist()))
+    row_mm, column_mm = carm.pixel_spacing_mm
+    return dataclasses.replace(
+        carm,
+        rows=shape[0],
+        columns=shape[1],
+        pixel_spacing_mm=(row_mm * factor, column_mm * factor),
+        principal_point_px=point,
+        projection_matrix=matrix,
+    )
+
+
+def _cells(old: int, anchor: float, factor: float) -> tuple[Array, int]:
+    """Shares of old pixels in new ones whose edges lie at ``anchor`` and whole factors from it.
+
+    Returns
+    -------
+    weights : (new, old) sparse, rows sum to 1
+    first : number of the first new pixel, counted from the one that begins at the anchor
+    """
+    first = int(np.floor((-0.5 - anchor) / factor + 1e-9))
+    last = int(np.ceil((old - 0.5 - anchor) / factor - 1e-9))
+    edges = np.clip(anchor + factor * np.arange(first, last + 1), -0.5, old - 0.5)
+    cuts = np.union1d(edges, np.arange(old + 1) - 0.5)
+    middle = 0.5 * (cuts[:-1] + cuts[1:])
+    new = np.clip(np.searchsorted(edges, middle) - 1, 0, len(edges) - 2)
+    share = np.diff(cuts) / np.maximum(np.diff(edges), 1e-12)[new]
+    at = np.rint(middle).astype(np.int64).clip(0, old - 1)
+    return sparse.csr_matrix((share, (new, at)), shape=(len(edges) - 1, old)), first

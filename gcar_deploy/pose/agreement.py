@@ -96,8 +96,9 @@ def poses_between(
     small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
     marks = landmark_pixels(options.landmarks, [view.carm for view in views])
     for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
-        scale = np.array([carm.columns / view.carm.columns, carm.rows / view.carm.rows])
-        marks[:, k] = (marks[:, k] + 0.5) * scale - 0.5
+        scale = np.array(carm.focal_px) / view.carm.focal_px
+        old, new = np.array(view.carm.principal_point), np.array(carm.principal_point)
+        marks[:, k] = (marks[:, k] - old) * scale + new
     if known is not None:
         return judged_poses(known, small, pose, marks, calibrated)
     return estimate_poses(small, pose, marks, calibrated)

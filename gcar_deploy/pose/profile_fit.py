@@ -20,6 +20,10 @@ from gcar_deploy.types import Array, Scalars
 
 #: relative change of the objective or of the pose below which a fit ends
 TOLERANCE = 1e-4
+#: finite differences reach so far, as a share of a parameter's prior
+STEP_SHARE = 3e-3
+#: digits of a correction that the pictures can tell, mm and deg
+DIGITS = 4
 #: error of the next fit, as a share of the difference that the last one left: small enough for
 #: the pictures to outweigh the priors of an angle that is 3 deg off
 TRIAL_SHARE = 0.1
@@ -43,13 +47,20 @@ def fit_profiles(
     options : PoseOptions
     calibrated : bool, all pictures hold path lengths in mm
     """
+    steps = STEP_SHARE * np.diag(prior)
+
+    def slopes(x: Array, sigma: float, noise: float) -> Array:
+        # Steps of the priors' size: a share of the value itself means nothing near zero.
+        here = residuals(x, sigma, noise)
+        ahead = [residuals(x + step, sigma, noise) - here for step in steps]
+        return np.stack(ahead, axis=1) / np.diag(steps)
 
     def fitted(x: Array, sigma: float, noise: float) -> Array:
         solution = least_squares(
-            residuals, x, args=(sigma, noise), diff_step=1e-3, x_scale=prior,
+            residuals, x, jac=slopes, args=(sigma, noise), x_scale=prior,
             ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=options.max_evaluations,
         )  # fmt: skip
-        out: Array = solution.x
+        out: Array = np.round(solution.x, DIGITS)
         return out
 
     if not calibrated:

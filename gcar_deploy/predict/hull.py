@@ -17,6 +17,10 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Array, Image, Points
 
+#: where a lattice stands about the origin, cells: in the middle between points, as voxels about an
+#: isocentre, and a little off it, since points that project onto the very edge of a pixel would
+#: be given to either side by the last digit
+OFF_MIDDLE = (0.5131, 0.4913, 0.5079)
 _CHILDREN = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
@@ -45,16 +49,21 @@ class Candidates:
 
 
 def cubic_lattice(grid: Grid, spacing_mm: float) -> Grid:
-    """Cover ``grid`` with cubic cells of about ``spacing_mm``; the grid itself where it fits."""
-    own = grid.spacing_mm
-    if np.ptp(own) < 1e-6 and abs(own[0] / spacing_mm - 1) < 1e-6:
-        return grid
-    shape = [int(n) for n in np.maximum(np.round(np.asarray(grid.size_mm) / spacing_mm), 1)]
-    size = [n * spacing_mm for n in shape]
+    """Cover ``grid`` with cubic cells of edge ``spacing_mm``.
+
+    The points belong to the scene, not to the volume that is asked for: they stand at whole
+    cells and ``OFF_MIDDLE`` from the origin, those inside ``grid`` (at least one along an axis).
+    """
+    off = np.asarray(OFF_MIDDLE) * spacing_mm
+    first = np.ceil((grid.lower_mm - off) / spacing_mm - 1e-9)
+    last = np.floor((grid.lower_mm + np.asarray(grid.size_mm) - off) / spacing_mm + 1e-9)
+    shape = np.maximum(last - first, 0) + 1
+    center = off + (first + 0.5 * (shape - 1)) * spacing_mm
+    size = shape * spacing_mm
     return Grid(
-        center_mm=grid.center_mm,
-        size_mm=(size[0], size[1], size[2]),
-        shape=(shape[0], shape[1], shape[2]),
+        center_mm=(float(center[0]), float(center[1]), float(center[2])),
+        size_mm=(float(size[0]), float(size[1]), float(size[2])),
+        shape=(int(shape[0]), int(shape[1]), int(shape[2])),
     )
 
 

@@ -87,6 +87,17 @@ class Tree:
         sizes = [len(branch) for branch in self.branches]
         return np.repeat(np.arange(len(sizes)), np.asarray(sizes, dtype=np.int64))
 
+    def moved(self, shift_mm: Points) -> Tree:
+        """Return the same tree moved by (3,) mm."""
+        return dataclasses.replace(
+            self,
+            nodes_mm=self.nodes_mm + shift_mm,
+            branches=tuple(
+                dataclasses.replace(branch, points_mm=branch.points_mm + shift_mm)
+                for branch in self.branches
+            ),
+        )
+
     def segments(self) -> tuple[Points, Points, Scalars, Scalars]:
         """Return the tapered capsules: (s, 3) starts, (s, 3) ends, (s,) radii at each."""
         starts = [branch.points_mm[:-1] for branch in self.branches]

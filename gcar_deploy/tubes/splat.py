@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from scipy import sparse
 
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.imaging.resample import coarsened
 from gcar_deploy.types import Array, Image, Points, Scalars
 
 
@@ -36,11 +36,8 @@ def shrunk(carm: CArm, picture: Image, pixel_mm: float) -> tuple[CArm, Image]:
     factor = max(round(pixel_mm / carm.pixel_at_isocenter_mm), 1)
     if factor == 1:
         return carm, picture
-    rows, cols = max(picture.shape[0] // factor, 1), max(picture.shape[1] // factor, 1)
-    small = cv2.resize(
-        np.ascontiguousarray(picture, dtype=np.float32), (cols, rows), interpolation=cv2.INTER_AREA
-    )
-    return carm.resized(rows, cols), small.astype(np.float32, copy=False)
+    carm, (small,) = coarsened(carm, (picture,), factor)
+    return carm, small
 
 
 def cell_view(carm: CArm, path_mm: Image, points_mm: Points, cell_mm: float) -> CellView:

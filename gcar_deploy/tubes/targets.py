@@ -11,6 +11,7 @@ import numpy as np
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.resample import coarsened
 from gcar_deploy.types import Array
 
 #: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
@@ -89,10 +90,7 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
     # Variances in pixels^2 of the working picture; a box of width b has b^2 / 12.
     variance = (options.edge_blur_mm / (own * factor)) ** 2 / 12
     if factor > 1:
-        size = (max(carm.columns // factor, 1), max(carm.rows // factor, 1))
-        path = cv2.resize(path, size, interpolation=cv2.INTER_AREA)
-        weight = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-        carm = carm.resized(size[1], size[0])
+        carm, (path, weight) = coarsened(carm, (path, weight), factor)
         variance += (1 - 1 / factor**2) / 12
     if level_mm:
         path = cv2.GaussianBlur(path, (0, 0), COARSE_BLUR_PX)

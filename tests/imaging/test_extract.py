@@ -8,9 +8,9 @@ import pytest
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import GeometryError, ImageError, RefusedError
 from gcar_deploy.imaging.extract import asks_network, extract_vessels
-from gcar_deploy.imaging.resample import area_average, resized
+from gcar_deploy.imaging.resample import area_average, coarsened, resized
 from tests.conftest import data_dir
-from tests.imaging.phantoms import PIXEL_MM, angiogram, raw_picture, tube_paths
+from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
 
 _OPTIONS = ImagingOptions()
 
@@ -193,6 +193,39 @@ def test_area_average_by_a_whole_factor_is_the_block_mean():
     picture = np.random.default_rng(0).random((32, 48)).astype(np.float32)
     blocks = picture.reshape(8, 4, 12, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(area_average(picture, 8, 12), blocks, rtol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [2, 2.7, 5.13])
+def test_coarser_pixels_keep_the_mass_and_see_the_same_points(factor):
+    small = carm(64, 51)
+    picture = np.zeros((64, 51), np.float32)
+    picture[20:40, 15:35] = np.random.default_rng(0).random((20, 20))
+    new, (coarse,) = coarsened(small, (picture,), factor)
+    assert coarse.shape == (new.rows, new.columns)
+    assert coarse.sum() * factor**2 == pytest.approx(picture.sum(), rel=1e-5)
+    assert new.pixel_at_isocenter_mm == pytest.approx(factor * small.pixel_at_isocenter_mm)
+    # the mean of the old pixels' places is the new pixel's place, but for parts of pixels
+    rows, columns = np.indices(picture.shape, dtype=np.float32)
+    _, (row, column) = coarsened(small, (rows, columns), factor)
+    at = np.array([[5, 6], [8, 3], [4, 4]])
+    old = np.stack([column[at[:, 1], at[:, 0]], row[at[:, 1], at[:, 0]]], axis=1)
+    np.testing.assert_allclose(new.rays(at), small.rays(old), atol=3e-5)
+
+
+def test_a_border_more_leaves_the_coarser_pixels_where_they_were():
+    picture = np.random.default_rng(1).random((64, 51)).astype(np.float32)
+    small = carm(64, 51)
+    column, row = small.principal_point
+    wide = dataclasses.replace(
+        carm(71, 54), principal_point_px=(column + 3, row + 7), pixel_spacing_mm=(
+            small.pixel_spacing_mm
+        ),
+    )  # fmt: skip
+    picture[:6] = picture[:, :6] = 0
+    one, (a,) = coarsened(small, (picture,), 2.7)
+    two, (b,) = coarsened(wide, (np.pad(picture, ((7, 0), (3, 0))),), 2.7)
+    down, right = np.subtract(two.principal_point[::-1], one.principal_point[::-1]).astype(int)
+    np.testing.assert_allclose(b[down:, right:], a, atol=1e-6)
 
 
 @pytest.mark.slow

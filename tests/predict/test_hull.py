@@ -76,8 +76,23 @@ def test_blank_view_gives_none():
     assert len(visual_hull(views, GRID, CandidateOptions())) == 0
 
 
-def test_cubic_lattice_keeps_a_grid_that_fits_and_covers_one_that_does_not():
-    assert cubic_lattice(GRID, 1.0) is GRID
+def test_a_lattice_belongs_to_the_scene_not_to_the_volume_asked_for():
+    lattice = cubic_lattice(GRID, 1.0)
+    assert lattice.shape == GRID.shape
+    # near the voxels of a grid about the isocentre, but off the edges between pixels
+    off = lattice.index2world(np.zeros((1, 3))) - GRID.index2world(np.zeros((1, 3)))
+    assert (np.abs(off) < 0.02).all() and (np.abs(off) > 0.005).all()
+    larger = Grid(center_mm=(7.3, -2.1, 0), size_mm=(120, 110, 97), shape=(60, 50, 40))
+    other = cubic_lattice(larger, 1.0)
+    steps = (other.index2world(np.zeros((1, 3))) - lattice.index2world(np.zeros((1, 3)))) / 1.0
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
+    a, b = (visual_hull(scene(), x, CandidateOptions()).points_mm for x in (lattice, other))
+    inside = (np.abs(b) < 48).all(axis=1)
+    assert len(a) > 100 and len(b) >= len(a)
+    np.testing.assert_allclose(a, b[inside], atol=1e-9)
+
+
+def test_a_lattice_covers_a_grid_of_other_voxels():
     flat = Grid(center_mm=(1, 2, 3), size_mm=(90, 90, 60), shape=(300, 300, 20))
     lattice = cubic_lattice(flat, 1.0)
     assert lattice.shape == (90, 90, 60)
