@@ -18,6 +18,7 @@ from gcar_deploy.imaging.fusion import fused
 from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
+from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
@@ -136,7 +137,9 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
     path = np.asarray(angiogram.pixels * np.float32(scale), dtype=np.float32)
     smallest = options.path_threshold_pixels * angiogram.carm.pixel_at_isocenter_mm
     valid = np.ones(path.shape, bool) if angiogram.valid is None else angiogram.valid
-    mask = (path > smallest) & valid
+    mask = vessels_in_noise(path, valid, angiogram.carm.pixel_at_isocenter_mm, smallest)
+    if mask is None:
+        mask = (path > smallest) & valid
     if angiogram.mask is not None:
         mask &= angiogram.mask
     if not mask.any():
