@@ -92,9 +92,9 @@ def in_own_frame(
 
 
 def _as_told(
-    found: Result, frame: OwnFrame, angiograms: Sequence[Angiogram], grid: Grid,
+    found: Reconstruction, frame: OwnFrame, angiograms: Sequence[Angiogram], grid: Grid,
     options: RunOptions,
-) -> Result:  # fmt: skip
+) -> Reconstruction:  # fmt: skip
     """Return the result in the coordinates and in the order that the scene was given in."""
     places = [frame.place(k) for k in range(len(angiograms))]
     poses = tuple(
@@ -122,7 +122,7 @@ def _reconstructed(
     options: RunOptions,
     models: tuple[Predictor | None, Segmenter | None],
     watch: Stopwatch,
-) -> Result:
+) -> Reconstruction:
     """Reconstruct a scene that stands in its own frame."""
     predictor, segmenter = models
 
