@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-
-from gcar_deploy.config import PictureLimits, RunOptions, check_options
+from gcar_deploy.config import PredictOptions, RunOptions, check_options
 from gcar_deploy.config.ranges import Range, check_number
-from gcar_deploy.dicom.header import is_dicom
-from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
-from gcar_deploy.errors import GeometryError, ImageError, UsageError
-from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
-from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.imaging.extract import above_half, asks_network
+from gcar_deploy.errors import RefusedError, UsageError
+from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.net import Segmenter, check_segmenter, load_segmenter
-from gcar_deploy.imaging.read import read_picture
-from gcar_deploy.predict import load_predictor, missing_predictor
+from gcar_deploy.inputs.order import Order, check_views
+from gcar_deploy.inputs.pictures import Geometry, Mask, Picture, prepare
+from gcar_deploy.output.bundle import check_extras
+from gcar_deploy.output.folder import check_target
+from gcar_deploy.predict import Predictor, load_predictor, missing_predictor
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.result import Result
 from gcar_deploy.stopwatch import OnProgress
-
-#: a file, an array of counts, or a picture that already knows its C-arm
-Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
-#: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
-Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
-_DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 
 
 class Engine:
@@ -71,14 +59,12 @@ class Engine:
         self.threads = threads or min(os.cpu_count() or 1, 4)
         wanted = self.options.predict
         self._predictor = load_predictor(model, wanted, threads=self.threads, session=session)
-        self._notes: tuple[str, ...] = ()
-        if self._predictor is None and wanted.predictor != "none":
-            self._notes = (missing_predictor(wanted.predictor),)
         check_segmenter(self.options.imaging.segmenter)
         self._segmenter: Segmenter | None = None
-        self._segmenter_lock = threading.Lock()
+        self._further: dict[str, Predictor | None] = {}
+        self._lock = threading.Lock()
         if self.options.imaging.segmenter == "net":
-            self._needed_segmenter()
+            self._needed_segmenter("net")
 
     @property
     def model(self) -> Mapping[str, str] | None:
@@ -97,22 +83,38 @@ class Engine:
         from gcar_deploy.selftest import tiny_case
 
         angiograms, grid, _ = tiny_case()
-        self._needed_segmenter()
+        self._needed_segmenter(self.options.imaging.segmenter)
         return float(self.reconstruct(angiograms, grid).seconds["total"])
 
-    def _needed_segmenter(self) -> Segmenter | None:
+    def _needed_segmenter(self, wanted: str) -> Segmenter | None:
         """Load the network that finds vessels once, when a picture first needs it."""
-        with self._segmenter_lock:
+        check_segmenter(wanted)
+        if wanted == "classic":
+            return None
+        with self._lock:
             if self._segmenter is None:
-                self._segmenter = load_segmenter(self.options.imaging.segmenter, self.threads)
+                self._segmenter = load_segmenter(wanted, self.threads)
             return self._segmenter
+
+    def _predictor_for(self, options: PredictOptions) -> tuple[Predictor | None, tuple[str, ...]]:
+        """Return the predictor that is wanted, loaded once, and a word if there is none."""
+        wanted, own = options.predictor, self._predictor
+        if wanted == "none":
+            return None, ()
+        if own is not None and wanted in ("auto", own.model.kind):
+            return own, ()
+        with self._lock:
+            if wanted not in self._further:
+                self._further[wanted] = load_predictor(None, options, threads=self.threads)
+        found = self._further[wanted]
+        return found, () if found is not None else (missing_predictor(wanted),)
 
     def reconstruct(
         self,
         views: Sequence[Picture],
         geometry: Geometry | None = None,
         *,
-        masks: Mapping[int, str | Path | np.ndarray] | None = None,
+        masks: Mapping[int, Mask] | None = None,
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
         cancel: Callable[[], bool] | None = None,
@@ -137,183 +139,99 @@ class Engine:
         """
         if deadline_s is not None:
             check_number("deadline_s", deadline_s, float, Range(1e-9, 1e9))
+        return self._solve(
+            _Task(views, geometry, masks or {}, self.options, deadline_s), on_progress, cancel
+        )
+
+    def reconstruct_order(
+        self,
+        order: Order,
+        *,
+        on_progress: OnProgress | None = None,
+        cancel: Callable[[], bool] | None = None,
+        limit_s: float | None = None,
+    ) -> Result:
+        """Reconstruct the tree of an order; what it leaves open is as this engine was set up.
+
+        Parameters
+        ----------
+        order : Order; ``deliver`` does what it says of the result
+        on_progress, cancel : as ``reconstruct``
+        limit_s : the longest deadline that is granted
+
+        Raises
+        ------
+        As ``reconstruct``, and ModelError where the order's predictor or segmenter is not there.
+        """
+        check_views(order)
+        limits = [limit for limit in (order.deadline_s, limit_s) if limit is not None]
+        options = order.options(self.options)
+        deadline_s = min(limits, default=None)
+        task = _Task(order.views, order.geometry, order.masks, options, deadline_s)
+        return self._solve(task, on_progress, cancel)
+
+    def _solve(
+        self, task: _Task, on_progress: OnProgress | None, cancel: Callable[[], bool] | None
+    ) -> Result:
         started = time.perf_counter()
-        angiograms, grid, notes = prepare(views, geometry, self.options)
-        angiograms = with_masks(angiograms, masks or {}, self.options.imaging.limits)
-        notes += [f"view {number}: the vessel mask is the user's" for number in masks or {}]
+        options = task.options
+        check_options(options)
+        predictor, missing = self._predictor_for(options.predict)
+        angiograms, grid, notes = prepare(task.views, task.geometry, options, task.masks)
+        wanted = options.imaging.segmenter if asks_network(angiograms) else "classic"
         found = reconstruct(
             angiograms,
             grid,
-            self.options,
-            predictor=self._predictor,
-            segmenter=self._needed_segmenter() if asks_network(angiograms) else None,
+            options,
+            predictor=predictor,
+            segmenter=self._needed_segmenter(wanted),
             on_progress=on_progress,
-            deadline_s=deadline_s,
+            deadline_s=task.deadline_s,
             cancel=cancel,
             used_s=time.perf_counter() - started,
         )
-        return Result.of(found, (*notes, *self._notes, *found.notes))
+        return Result.of(found, (*notes, *missing, *found.notes))
 
 
-def prepare(
-    views: Sequence[Picture], geometry: Geometry | None, options: RunOptions
-) -> tuple[list[Angiogram], Grid, list[str]]:
-    """Pair pictures with their views.
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """What is given, and how it is to be done."""
 
-    Returns
-    -------
-    angiograms, grid asked for, sentences worth telling
-
-    Raises
-    ------
-    UsageError
-        Fewer than two pictures.
-    GeometryError
-        Not as many pictures as views, or sizes at odds.
-    ImageError
-        A picture cannot be read.
-    """
-    if len(views) < 2:
-        raise UsageError(f"{len(views)} picture given; two or more are needed")
-    if geometry is None:
-        return _from_headers(views, options)
-    given = [view for view in views if isinstance(view, Angiogram)]
-    if isinstance(geometry, Grid):
-        if len(given) != len(views):
-            raise UsageError("a Grid alone tells no geometry: give a scene, or Angiograms")
-        return given, geometry, []
-    scene = _scene(geometry)
-    if len(scene.views) != len(views):
-        raise GeometryError(
-            f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
-        )
-    notes = list(scene.warnings)
-    angiograms = []
-    frames = _frames_for(views, options)
-    for picture, view in zip(views, scene.views, strict=True):
-        if isinstance(picture, Angiogram):
-            angiograms.append(picture)
-            continue
-        if isinstance(picture, (str, Path)) and is_dicom(picture):
-            run = read_run(picture, options.dicom, frames.pop(0))
-            carm = _matched(view, run.pixels.shape, notes)
-            angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
-            notes += [f"view {view.id}: {note}" for note in run.notes]
-            continue
-        if isinstance(picture, np.ndarray):
-            pixels, depth, sha256 = _from_array(view.id, picture, options.imaging.limits)
-        else:
-            pixels, depth, sha256 = read_picture(picture, options.imaging.limits)
-        carm = _matched(view, pixels.shape, notes)
-        angiograms.append(
-            Angiogram(
-                view_id=view.id,
-                carm=carm,
-                pixels=pixels,
-                bit_depth=depth,
-                intensity=view.intensity,
-                sha256=sha256,
-            )
-        )
-    return angiograms, scene.volume_grid(), notes
+    views: Sequence[Picture]
+    geometry: Geometry | None
+    masks: Mapping[int, Mask]
+    options: RunOptions
+    deadline_s: float | None
 
 
-def with_masks(
-    angiograms: Sequence[Angiogram],
-    masks: Mapping[int, str | Path | np.ndarray],
-    limits: PictureLimits,
-) -> list[Angiogram]:
-    """Give pictures the user's vessel masks.
+def check_target_of(order: Order) -> Path:
+    """Find out, before any work, whether the order's result can be written; return its folder.
 
     Raises
     ------
     UsageError
-        There is no view of that number.
-    ImageError
-        A mask cannot be read, has another size than its picture, or no vessel.
+        ``out`` is missing, stands in the way or holds one of the order's files, or a further
+        file needs a library that is not installed.
     """
-    out = list(angiograms)
-    for number, given in masks.items():
-        if not 1 <= number <= len(out):
-            raise UsageError(f"mask {number}: there are views 1 .. {len(out)}")
-        array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
-        shape = out[number - 1].pixels.shape
-        if array.shape != shape:
-            raise ImageError(
-                f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
-            )
-        mask = above_half(array)
-        if not mask.any() or mask.mean() > 0.9:
-            raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
-        out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)
-    return out
+    if order.out is None:
+        raise UsageError("out is missing: name the folder for the result")
+    check_target(order.out, force=order.force, inputs=tuple(order.files.values()))
+    check_extras(order.extras)
+    return order.out
 
 
-def _from_headers(
-    views: Sequence[Picture], options: RunOptions
-) -> tuple[list[Angiogram], Grid, list[str]]:
-    """Pictures whose own headers tell the geometry: DICOM XA alone."""
-    paths = [view for view in views if isinstance(view, (str, Path))]
-    for path in paths:
-        if not is_dicom(path):
-            raise UsageError(
-                f"{Path(path).name} is no DICOM file: its geometry is needed (--geom geom.json)"
-            )
-    if len(paths) != len(views):
-        raise UsageError("pictures in memory tell no geometry: give a scene")
-    angiograms, scene, notes = read_views(paths, options.dicom)
-    return angiograms, scene.volume_grid(), notes
+def deliver(result: Result, order: Order) -> Path:
+    """Write the result folder that an order asks for.
 
-
-def _frames_for(views: Sequence[Picture], options: RunOptions) -> list[int | None]:
-    """Frame of each DICOM file among the pictures, in their order."""
-    runs = sum(isinstance(view, (str, Path)) and is_dicom(view) for view in views)
-    return list(wanted_frames(options.dicom, runs)) if runs else []
-
-
-def _matched(view: View, shape: tuple[int, ...], notes: list[str]) -> CArm:
-    """Fit a view to the size of its picture; what was rescaled is added to ``notes``."""
-    try:
-        carm, note = match_picture(view.carm, shape[0], shape[1])
-    except GeometryError as error:
-        raise GeometryError(f"view {view.id}: {error}") from None
-    if note:
-        notes.append(f"view {view.id}: {note}")
-    return carm
-
-
-def _from_array(
-    view_id: str, array: np.ndarray, limits: PictureLimits
-) -> tuple[np.ndarray, int, str]:
-    """Like ``read_picture`` for counts that are in memory already."""
-    depth = _DEPTHS.get(array.dtype.name)
-    if depth is None or array.ndim != 2:
-        raise ImageError(
-            f"view {view_id}: an array of {array.dtype} with {array.ndim} dimensions; give "
-            "(rows, columns) of uint8, uint16, float32 or float64"
-        )
-    if not limits.min_side <= min(array.shape) <= max(array.shape) <= limits.max_side:
-        raise ImageError(
-            f"view {view_id}: {array.shape[0]} x {array.shape[1]} pixels; each side must be "
-            f"{limits.min_side} .. {limits.max_side}"
-        )
-    if not (np.isfinite(array).all() and array.min() >= 0):
-        raise ImageError(f"view {view_id}: grey values must be finite and not negative")
-    sha256 = hashlib.sha256(f"{array.dtype.name}{array.shape}".encode())
-    sha256.update(np.ascontiguousarray(array).tobytes())
-    return array.astype(np.float32), depth, sha256.hexdigest()
-
-
-def _scene(geometry: Geometry) -> Scene:
-    if isinstance(geometry, Scene):
-        return geometry
-    if isinstance(geometry, Mapping):
-        import json
-
-        try:
-            return parse_scene(json.dumps(dict(geometry)), "geometry")
-        except (TypeError, ValueError) as error:
-            raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
-    if isinstance(geometry, (str, Path)):
-        return load_scene(geometry)
-    raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")
+    Raises
+    ------
+    RefusedError
+        The order is strict and the result degraded.
+    UsageError, GcarError
+        As ``Result.save``.
+    """
+    if order.out is None:
+        raise UsageError("out is missing: name the folder for the result")
+    if order.strict and result.status != "ok":
+        raise RefusedError(f"degraded, and strict was asked for: {result.quality.sentence}")
+    return result.save(order.out, force=order.force, extras=order.extras)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gcar_deploy.config import RunOptions, check_options
-from gcar_deploy.engine import prepare
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.frame import own_frame
@@ -22,6 +21,7 @@ from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
 from gcar_deploy.imaging.net import load_segmenter
+from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, load_predictor, quick_tree
 from gcar_deploy.quality import check_views
@@ -66,14 +66,17 @@ class Inspection:
 
 
 def inspect_files(
-    pictures: Sequence[str | Path], geom: str | Path | None, options: RunOptions | None = None
+    pictures: Sequence[str | Path],
+    geom: Geometry | None,
+    options: RunOptions | None = None,
+    masks: Mapping[int, Mask] | None = None,
 ) -> Inspection:
     """Read and judge; errors end the inspection and stand in it, nothing is raised."""
     options = options or RunOptions()
     found = Inspection()
     try:
         check_options(options)
-        angiograms, grid, warnings = prepare(pictures, geom, options)
+        angiograms, grid, warnings = prepare(pictures, geom, options, masks)
         found.warnings += warnings
         carms = [a.carm for a in angiograms]
         for a in angiograms:

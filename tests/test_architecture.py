@@ -22,7 +22,7 @@ FLOORS = {
             "models",
             "imaging",
             "gaussians dicom",
-            "tree",
+            "tree inputs",
             "predict tubes measure",
             "quality",
             "pose",

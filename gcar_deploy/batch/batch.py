@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.batch.cases import BatchCase
-from gcar_deploy.batch.pools import in_processes, on_dask
+from gcar_deploy.batch.pools import Pool, in_processes, on_dask
 from gcar_deploy.batch.summary import write_summary
-from gcar_deploy.batch.work import BatchJob
+from gcar_deploy.batch.work import BatchEngine, BatchJob
 from gcar_deploy.errors import UsageError
 
 SCHEMA = "gcar-batch/1"
@@ -22,10 +23,9 @@ OnCase = Callable[[int, int, str], None]
 def run_batch(
     cases: Sequence[BatchCase],
     out: Path,
-    options: Mapping[str, Any],
+    engine: BatchEngine,
     *,
-    processes: int = 1,
-    scheduler: str | None = None,
+    pool: Pool = Pool(),  # noqa: B008 - frozen
     force: bool = False,
     on_case: OnCase | None = None,
 ) -> list[dict[str, Any]]:
@@ -35,9 +35,8 @@ def run_batch(
     ----------
     cases : as ``read_cases`` returns them
     out : folder of an earlier run of the same, or a new one
-    options : predictor, refiner, model, threads, deadline_s
-    processes : on this machine
-    scheduler : address of a Dask scheduler instead, or None
+    engine : which engine does them
+    pool : where they run
     force : run cases again whose files or options have changed since, and failed ones
     on_case : told of each finished case
 
@@ -54,7 +53,7 @@ def run_batch(
     rows: dict[str, dict[str, Any]] = {}
     missing: list[BatchJob] = []
     for case in cases:
-        fingerprint = case.fingerprint(options)
+        fingerprint = case.fingerprint(engine)
         row = _read_row(rows_folder / f"{case.name}.json")
         if row is not None and row["fingerprint"] != fingerprint and not force:
             raise UsageError(
@@ -65,10 +64,18 @@ def run_batch(
         if row is not None and row["fingerprint"] == fingerprint and not (force and failed):
             rows[case.name] = row
             continue
-        missing.append(_job(case, out, rows_folder, fingerprint, options, scheduler))
+        # The workers of a cluster have working folders of their own.
+        order = dataclasses.replace(case.order, out=out / case.name).relative_to(Path.cwd())
+        marker = str((rows_folder / f"{case.name}.running").absolute())
+        missing.append(
+            BatchJob(
+                case=case.name, order=order, engine=engine, fingerprint=fingerprint,
+                marker=marker if pool.scheduler is None else None,
+            )
+        )  # fmt: skip
     if on_case is not None:
         on_case(len(rows), len(cases), "")
-    for row in _done(missing, processes, scheduler):
+    for row in _done(missing, pool):
         _write_row(rows_folder / f"{row['case']}.json", row)
         rows[row["case"]] = row
         if on_case is not None:
@@ -94,32 +101,12 @@ def _own(out: Path) -> Path:
     return rows
 
 
-def _job(
-    case: BatchCase,
-    out: Path,
-    rows: Path,
-    fingerprint: str,
-    options: Mapping[str, Any],
-    scheduler: str | None,
-) -> BatchJob:
-    # The workers of a cluster have working folders of their own.
-    return BatchJob(
-        case=case.name,
-        views=tuple(str(path.absolute()) for path in case.views),
-        geometry=None if case.geometry is None else str(case.geometry.absolute()),
-        out=str((out / case.name).absolute()),
-        marker=str((rows / f"{case.name}.running").absolute()) if scheduler is None else None,
-        fingerprint=fingerprint,
-        **options,
-    )
-
-
-def _done(
-    jobs: Sequence[BatchJob], processes: int, scheduler: str | None
-) -> Iterator[dict[str, Any]]:
+def _done(jobs: Sequence[BatchJob], pool: Pool) -> Iterator[dict[str, Any]]:
     if not jobs:
         return iter(())
-    return in_processes(jobs, processes) if scheduler is None else on_dask(jobs, scheduler)
+    if pool.scheduler is not None:
+        return on_dask(jobs, pool.scheduler)
+    return in_processes(jobs, pool.processes)
 
 
 def _read_row(path: Path) -> dict[str, Any] | None:

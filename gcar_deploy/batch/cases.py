@@ -8,43 +8,56 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from gcar_deploy.batch.work import BatchEngine
+from gcar_deploy.config import Landmark
 from gcar_deploy.errors import UsageError
+from gcar_deploy.files import text_of
+from gcar_deploy.inputs.order import Order, check_views
+from gcar_deploy.inputs.words import parse_frames, parse_landmark
 
 #: names become folders
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _VIEW = re.compile(r"view([1-9][0-9]?)")
+_MASK = re.compile(r"mask([1-9]|1[0-6])")
 _RESERVED = ("rows", "summary.csv", "summary.html", "batch.json")
 MOST_CASES = 100_000
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class BatchCase:
-    """One case: its name (also of its folder), pictures and geometry file (None for DICOM)."""
+    """One case: its name, also of its folder, and its order, which has no folder yet."""
 
     name: str
-    views: tuple[Path, ...]
-    geometry: Path | None
+    order: Order
 
-    def fingerprint(self, options: Mapping[str, Any]) -> str:
+    def fingerprint(self, engine: BatchEngine) -> str:
         """SHA-256 of everything the result depends on; unreadable files count as absent."""
-        digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
-        for path in (*([self.geometry] if self.geometry else []), *self.views):
+        order = self.order.with_files(lambda _, path: Path(path.name))
+        what = {"order": order.to_dict(), "engine": dataclasses.asdict(engine)}
+        digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode())
+        for name, path in self.order.files.items():
             try:
                 content = hashlib.sha256(path.read_bytes()).digest()
             except OSError:
                 content = b"absent"
-            digest.update(path.name.encode("utf-8", "surrogateescape") + b"\0" + content)
+            digest.update(name.encode() + b"\0" + content)
         return digest.hexdigest()
 
 
-def read_cases(table: Path) -> list[BatchCase]:
+def read_cases(table: Path, like: Order) -> list[BatchCase]:
     """Read ``case,geom,view1,view2[,view3 ...]``; paths are relative to the table.
 
-    ``geom`` may be empty where the views are DICOM XA.
+    ``geom`` may be empty where the views are DICOM XA. Columns ``mask1`` ... and those of
+    ``COLUMNS`` say more of a case; an empty field leaves what ``like`` says.
+
+    Parameters
+    ----------
+    table : file
+    like : Order, what holds for every case
 
     Raises
     ------
@@ -53,8 +66,8 @@ def read_cases(table: Path) -> list[BatchCase]:
         case by case.
     """
     try:
-        text = table.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
+        text = text_of(table.read_bytes())
+    except (OSError, ValueError):
         raise UsageError(f"{table} cannot be read as a table (UTF-8, comma-separated)") from None
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     try:
@@ -66,7 +79,7 @@ def read_cases(table: Path) -> list[BatchCase]:
         raise UsageError(f"{table.name}: {len(lines)} cases; 1 .. {MOST_CASES} are taken")
     cases: dict[str, BatchCase] = {}
     for number, line in enumerate(lines, start=2):
-        case = _case(table, number, line, columns)
+        case = _case(table, number, line, columns, like)
         if case.name.lower() in (name.lower() for name in cases):
             raise UsageError(f"{table.name}: line {number}: case {case.name!r} stands there twice")
         cases[case.name] = case
@@ -82,29 +95,61 @@ def _view_columns(table: Path, names: Any) -> list[str]:
             raise UsageError(f"{table.name}: column {name!r} is missing")
     if views[:2] != ["view1", "view2"]:
         raise UsageError(f"{table.name}: columns 'view1' and 'view2' are missing")
-    unknown = set(names) - {"case", "geom", *views}
+    unknown = {name for name in names if not _MASK.fullmatch(name)}
+    unknown -= {"case", "geom", *views, *COLUMNS}
     if unknown:
         raise UsageError(f"{table.name}: unknown column {sorted(unknown)[0]!r}")
     return views
 
 
-def _case(table: Path, number: int, line: Mapping[Any, Any], columns: list[str]) -> BatchCase:
+def _case(
+    table: Path, number: int, line: Mapping[Any, Any], columns: list[str], like: Order
+) -> BatchCase:
     where = f"{table.name}: line {number}"
     if None in line:
         raise UsageError(f"{where}: more fields than columns")
-    name = (line["case"] or "").strip()
+    told = {name: (text or "").strip() for name, text in line.items()}
+    name = told["case"]
     if not _NAME.fullmatch(name) or name.lower() in _RESERVED:
         raise UsageError(
             f"{where}: case {name!r} must be letters, digits, '.', '_' or '-' (it names a folder)"
         )
-    cells = [(line[column] or "").strip() for column in columns]
+    cells = [told[column] for column in columns]
     while cells and not cells[-1]:
         cells.pop()
     if len(cells) < 2 or not all(cells):
         raise UsageError(f"{where}: two or more views, without a gap, are needed")
-    geometry, folder = (line["geom"] or "").strip(), table.parent
-    return BatchCase(
-        name=name,
-        views=tuple(folder / cell for cell in cells),
-        geometry=folder / geometry if geometry else None,
-    )
+    try:
+        order = dataclasses.replace(
+            like,
+            views=tuple(Path(cell) for cell in cells),
+            geometry=Path(told["geom"]) if told["geom"] else None,
+            masks={int(k[4:]): Path(v) for k, v in told.items() if _MASK.fullmatch(k) and v},
+            **{COLUMNS[k][0]: COLUMNS[k][1](v) for k, v in told.items() if k in COLUMNS and v},
+        )
+        check_views(order)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from None
+    return BatchCase(name, order.relative_to(table.parent))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"{text[:40]!r} must be a number") from None
+
+
+def _landmarks(text: str) -> tuple[Landmark, ...]:
+    return tuple(parse_landmark(word) for word in text.split())
+
+
+#: column that says more of a case -> key of its order, reader of its text
+COLUMNS: Mapping[str, tuple[str, Callable[[str], Any]]] = {
+    "frame": ("frames", parse_frames),
+    "landmarks": ("landmarks", _landmarks),
+    "pixel_spacing_mm": ("pixel_spacing_mm", _number),
+    "sod_mm": ("sod_mm", _number),
+    "deadline_s": ("deadline_s", _number),
+    **{key: (key, str) for key in ("segmenter", "predictor", "refiner", "pose")},
+}

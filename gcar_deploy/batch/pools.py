@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import dataclasses
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -14,6 +15,14 @@ from gcar_deploy.errors import UsageError
 
 #: seconds to reach a scheduler
 CONNECT_S = 30
+
+
+@dataclasses.dataclass(frozen=True)
+class Pool:
+    """Processes of this machine, or the address of a Dask scheduler instead."""
+
+    processes: int = 1
+    scheduler: str | None = None
 
 
 def in_processes(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str, Any]]:
@@ -49,7 +58,7 @@ def _pool(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str, Any]]:
         min(processes, len(jobs)),
         mp_context=multiprocessing.get_context("spawn"),
         initializer=prepare_process,
-        initargs=(jobs[0].threads,),
+        initargs=(jobs[0].engine.threads,),
     ) as pool:
         try:
             for future in concurrent.futures.as_completed(

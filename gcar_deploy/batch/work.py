@@ -9,13 +9,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.errors import CancelledError, GcarError, RefusedError
+from gcar_deploy.errors import GcarError, RefusedError
+from gcar_deploy.inputs.order import Order
 
 #: columns of summary.csv, in order
 COLUMNS = (
     "case", "status", "exit_code", "sentence", "branches", "length_mm", "gaussians",
     "separation_deg", "least_coverage", "largest_stenosis_percent", "seconds",
 )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchEngine:
+    """Which engine does the cases: model file (None for the shipped one) and threads."""
+
+    model: str | None = None
+    threads: int | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,24 +34,17 @@ class BatchJob:
     Attributes
     ----------
     case : name
-    views, geometry : files
-    out : result folder
+    order : with files and result folder by their full paths
+    engine : BatchEngine
     marker : exists while the case runs, so that a process that dies names its case; or None
     fingerprint : of everything the result depends on
-    predictor, refiner, model, threads, deadline_s : as the options of ``gcar run``
     """
 
     case: str
-    views: tuple[str, ...]
-    geometry: str | None
-    out: str
+    order: Order
+    engine: BatchEngine
     marker: str | None
     fingerprint: str
-    predictor: str
-    refiner: str
-    model: str | None
-    threads: int | None
-    deadline_s: float | None
 
 
 def run_case(job: BatchJob) -> dict[str, Any]:
@@ -74,31 +76,29 @@ def prepare_process(threads: int | None) -> None:
 
 
 @functools.lru_cache(maxsize=2)
-def _engine(model: str | None, threads: int | None, predictor: str, refiner: str) -> Any:
+def _engine(engine: BatchEngine, predictor: str | None) -> Any:
     from gcar_deploy.config import RunOptions
     from gcar_deploy.engine import Engine
 
-    options = RunOptions()
-    options = dataclasses.replace(
-        options,
-        predict=dataclasses.replace(options.predict, predictor=predictor),
-        refine=dataclasses.replace(options.refine, refiner=refiner),
-    )
-    return Engine(model, threads=threads, options=options)
+    options = Order(predictor=predictor).options(RunOptions())
+    return Engine(engine.model, threads=engine.threads, options=options)
 
 
 def _solved(job: BatchJob) -> dict[str, Any]:
     try:
-        engine = _engine(job.model, job.threads, job.predictor, job.refiner)
-        result = engine.reconstruct(list(job.views), job.geometry, deadline_s=job.deadline_s)
-        out = Path(job.out)
+        engine = _engine(job.engine, job.order.predictor)
+        from gcar_deploy.engine import check_target_of, deliver
+
+        out = job.order.out
         # A folder without a row is what an interrupted batch left.
-        result.save(out, force=(out / "result.json").is_file())
+        left = out is not None and (out / "result.json").is_file()
+        order = dataclasses.replace(job.order, force=left)
+        check_target_of(order)
+        result = engine.reconstruct_order(order)
+        deliver(result, order)
         return _row(job.case, result.summary())
     except RefusedError as error:
         return error_row(job.case, "refused", str(error), error.exit_code)
-    except CancelledError as error:
-        return error_row(job.case, "failed", str(error), error.exit_code)
     except GcarError as error:
         return error_row(job.case, "failed", str(error), error.exit_code)
     except Exception as error:  # noqa: BLE001 - one broken case must not stop the rest

@@ -19,12 +19,13 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.data.demo_case import demo_case
-from gcar_deploy.engine import Engine, prepare
+from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import point_sigmas
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.resample import area_average
+from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.measure.metrics import volume_dice
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.tree.tree import Tree

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import sys
@@ -10,50 +11,52 @@ from pathlib import Path
 
 import click
 
-from gcar_deploy.cli.common import engine_options, limit_threads, output_options, set_up_logging
+from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, gathered, talk_options
+from gcar_deploy.cli.request import EXTRA_FILES, METHOD, order_options
+from gcar_deploy.inputs.order import Order
+
+
+@dataclasses.dataclass(frozen=True)
+class Where:
+    """Where the cases run."""
+
+    jobs: int | None
+    place: str
+    scheduler: str | None
+
+
+_WHERE = {
+    "scheduler": click.option("--scheduler", metavar="ADDRESS", help="Of the Dask cluster."),
+    "place": click.option(
+        "--engine", "place", type=click.Choice(["processes", "dask"]), default="processes",
+        show_default=True, help="Where the cases run.",
+    ),
+    "jobs": click.option(
+        "--jobs", type=click.IntRange(1, 512), help="Processes; a core each by default."
+    ),
+}  # fmt: skip
 
 
 @click.command("batch")
 @click.argument("table", type=click.Path(path_type=Path), metavar="CASES.CSV")
-@click.option(
-    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="Folder of folders."
-)
-@click.option(
-    "--jobs", type=click.IntRange(1, 512), default=None, help="Processes; a core each by default."
-)
-@click.option(
-    "--engine",
-    "where",
-    type=click.Choice(["processes", "dask"]),
-    default="processes",
-    show_default=True,
-    help="Where the cases run.",
-)
-@click.option("--scheduler", default=None, metavar="ADDRESS", help="Of the Dask cluster.")
+@order_options(
+    "out", *METHOD, "frames", "pixel_spacing_mm", "sod_mm", "segmenter", "pose", "strict", "force",
+    *EXTRA_FILES,
+)  # fmt: skip
+@gathered("where", Where, _WHERE)
 @engine_options
-@click.option("--force", is_flag=True, help="Run changed and failed cases again.")
-@output_options
-def batch(
-    table: Path,
-    out_dir: Path,
-    jobs: int | None,
-    where: str,
-    scheduler: str | None,
-    predictor: str,
-    model: str | None,
-    refiner: str,
-    deadline: float | None,
-    threads: int | None,
-    force: bool,
-    verbose: bool,
-    quiet: bool,
-    as_json: bool,
-) -> None:
+@talk_options()
+def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: Talk) -> None:
     """Reconstruct every case of a table (columns case, geom, view1, view2 ...).
 
+    Further columns hold for one case and win over the options: mask1 ..., frame, landmarks
+    (C1,R1:C2,R2, several apart by spaces), pixel_spacing_mm, sod_mm, segmenter, predictor, refiner,
+    pose, deadline_s.
+
     Writes a result folder a case, summary.csv and summary.html. A case that fails is a row
-    with its reason and never stops the rest; the same command goes on where it was stopped.
-    Exit code 0 when the table is done, whatever became of its cases.
+    with its reason and never stops the rest; the same command goes on where it was stopped, and
+    runs changed and failed cases again with --force. Exit code 0 when the table is done, whatever
+    became of its cases.
 
     \b
     Example:
@@ -62,42 +65,40 @@ def batch(
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
 
-    set_up_logging(verbose, quiet)
-    if (where == "dask") != (scheduler is not None):
+    talk.set_up()
+    if order.out is None:
+        raise UsageError("--out is missing: name a folder for the results")
+    if (where.place == "dask") != (where.scheduler is not None):
         raise UsageError("--engine dask and --scheduler ADDRESS go together")
-    jobs = jobs or _cores()
-    threads = threads or (1 if jobs > 1 and where == "processes" else None)
-    if where == "processes":
+    jobs = where.jobs or _cores()
+    if where.place == "processes":
+        if engine.threads is None and jobs > 1:
+            engine = dataclasses.replace(engine, threads=1)
         # The processes inherit the limits.
-        limit_threads(threads)
+        engine.limit_threads()
     from gcar_deploy.batch.batch import run_batch
     from gcar_deploy.batch.cases import read_cases
+    from gcar_deploy.batch.pools import Pool
+    from gcar_deploy.batch.work import BatchEngine
 
-    cases = read_cases(table)
-    options = {
-        "predictor": predictor,
-        "refiner": refiner,
-        "model": None if model is None else str(Path(model).absolute()),
-        "threads": threads,
-        "deadline_s": deadline,
-    }
-    hidden = quiet or not sys.stderr.isatty()
+    cases = read_cases(table, dataclasses.replace(order, out=None, force=False))
+    model = None if engine.model is None else str(Path(engine.model).absolute())
+    hidden = talk.quiet or not sys.stderr.isatty()
     with click.progressbar(length=len(cases), file=sys.stderr, hidden=hidden) as bar:
         rows = run_batch(
             cases,
-            out_dir,
-            options,
-            processes=jobs,
-            scheduler=scheduler,
-            force=force,
+            order.out,
+            BatchEngine(model, engine.threads),
+            pool=Pool(jobs, where.scheduler),
+            force=order.force,
             on_case=lambda done, *_: bar.update(done - bar.pos),
         )
-    if as_json:
-        click.echo(json.dumps({"out": str(out_dir), "cases": rows}, allow_nan=False))
+    if talk.as_json:
+        click.echo(json.dumps({"out": str(order.out), "cases": rows}, allow_nan=False))
         return
     counts = Counter(row["status"] for row in rows)
     said = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
-    click.echo(f"{out_dir}\n{len(rows)} cases: {said}\n{out_dir / 'summary.html'}")
+    click.echo(f"{order.out}\n{len(rows)} cases: {said}\n{order.out / 'summary.html'}")
 
 
 def _cores() -> int:

@@ -3,19 +3,45 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 from pathlib import Path
 from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import ProgressBar, limit_threads, set_up_logging
+from gcar_deploy.cli.common import EngineChoice, ProgressBar, Talk, gathered, talk_options
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 COLUMNS = (
     "case", "predictor", "refiner", "iterations", "gaussians_cap", "pixels", "status",
     "gaussians", "p50_s", "p95_s", "pairs", "peak_mb", "dsc", "rmse_mm", "p95_mm", "over_bound",
 )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Extent:
+    """How much is measured."""
+
+    data: Path | None
+    quick: bool
+    repeats: int
+    threads: int | None
+
+
+_EXTENT = {
+    "threads": click.option("--threads", type=click.IntRange(1, 256), help="At most so many."),
+    "repeats": click.option(
+        "--repeats", type=click.IntRange(1, 100), default=5, show_default=True,
+        help="Timings of each.",
+    ),
+    "quick": click.option(
+        "--quick", is_flag=True, help="A coarse grid: about a tenth of the time."
+    ),
+    "data": click.option(
+        "--data", type=_FOLDER, help="Label volumes to simulate views of, beside the demo."
+    ),
+}  # fmt: skip
 
 
 @click.command("bench")
@@ -27,26 +53,10 @@ COLUMNS = (
     "--stages", is_flag=True,
     help="Only print seconds per stage, of a new process and of a warm engine.",
 )  # fmt: skip
-@click.option("--data", type=_FOLDER, help="Label volumes to simulate views of, beside the demo.")
-@click.option("--quick", is_flag=True, help="A coarse grid: about a tenth of the time.")
-@click.option(
-    "--repeats", type=click.IntRange(1, 100), default=5, show_default=True, help="Timings of each."
-)
-@click.option("--threads", type=click.IntRange(1, 256), default=None, help="At most so many.")
+@gathered("extent", Extent, _EXTENT)
 @click.option("--force", is_flag=True, help="Replace bench.csv and bench.svg in the folder.")
-@click.option("--quiet", is_flag=True, help="Neither progress nor warnings.")
-@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
-def bench(
-    out_dir: Path | None,
-    stages: bool,
-    data: Path | None,
-    quick: bool,
-    repeats: int,
-    threads: int | None,
-    force: bool,
-    quiet: bool,
-    verbose: bool,
-) -> None:
+@talk_options("quiet", "verbose")
+def bench(out_dir: Path | None, stages: bool, extent: Extent, force: bool, talk: Talk) -> None:
     """Measure speed against error on the demo tree: bench.csv and bench.svg.
 
     The grid runs over iterations, Gaussians, resolution, refiner and predictor. Times are those
@@ -60,10 +70,10 @@ def bench(
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
 
-    set_up_logging(verbose, quiet)
-    limit_threads(threads)
+    talk.set_up()
+    EngineChoice(None, extent.threads).limit_threads()
     if stages:
-        click.echo(_stages(repeats, threads, quiet))
+        click.echo(_stages(extent.repeats, extent.threads, talk.quiet))
         return
     if out_dir is None:
         raise UsageError("--out is missing: name a new folder, or ask for --stages")
@@ -75,12 +85,14 @@ def bench(
         raise UsageError(f"{out_dir} is not a folder")
     from gcar_deploy.bench import tradeoff as benchmark
 
-    cases = [benchmark.demo(), *(benchmark.label_cases(data) if data else [])]
-    grid = benchmark.cells(quick)
+    cases = [benchmark.demo(), *(benchmark.label_cases(extent.data) if extent.data else [])]
+    grid = benchmark.cells(extent.quick)
     pair = benchmark.pair_seconds(cases[0])
     rows: list[benchmark.Row] = []
-    with ProgressBar(quiet=quiet) as bar:
-        for row in benchmark.run(cases, grid, repeats=repeats, threads=threads, pair=pair):
+    with talk.bar() as bar:
+        for row in benchmark.run(
+            cases, grid, repeats=extent.repeats, threads=extent.threads, pair=pair
+        ):
             rows.append(row)
             bar(f"{row.case} {row.cell.refiner}", len(rows) / (len(grid) * len(cases)))
     out_dir.mkdir(parents=True, exist_ok=True)

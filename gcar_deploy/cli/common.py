@@ -1,17 +1,23 @@
-"""What several verbs share: logging, the progress bar, the options of a reconstruction."""
+"""What several verbs share: logging, the progress bar, which engine does the work."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import json
 import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from gcar_deploy.engine import Engine
+    from gcar_deploy.inputs.order import Order
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _WIDTH = 28
@@ -50,119 +56,115 @@ class ProgressBar:
         self.close()
 
 
-def set_up_logging(verbose: bool, quiet: bool) -> None:
-    """Messages of the package go to stderr: all with -v, errors alone with --quiet."""
-    level = logging.DEBUG if verbose else logging.ERROR if quiet else logging.WARNING
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("gcar: %(message)s"))
-    logger = logging.getLogger("gcar_deploy")
-    logger.handlers[:] = [handler]
-    logger.setLevel(level)
-    logger.propagate = False
+@dataclasses.dataclass(frozen=True)
+class Talk:
+    """How much a verb says, and in which form."""
+
+    verbose: bool = False
+    quiet: bool = False
+    as_json: bool = False
+
+    def set_up(self) -> None:
+        """Messages of the package go to stderr: all with -v, errors alone with --quiet."""
+        level = logging.DEBUG if self.verbose else logging.ERROR if self.quiet else logging.WARNING
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("gcar: %(message)s"))
+        logger = logging.getLogger("gcar_deploy")
+        logger.handlers[:] = [handler]
+        logger.setLevel(level)
+        logger.propagate = False
+
+    def bar(self) -> ProgressBar:
+        """Return a progress bar, silent where that is wanted."""
+        return ProgressBar(quiet=self.quiet)
+
+    def note(self, lines: Iterable[str]) -> None:
+        """Say sentences on stderr, unless quiet."""
+        for line in () if self.quiet else lines:
+            click.echo(f"gcar: {line}", err=True)
+
+    @contextlib.contextmanager
+    def refusals(self) -> Iterator[None]:
+        """With --json, a solve that is refused or fails is an object on stdout as well."""
+        from gcar_deploy.errors import NumericalError, RefusedError
+
+        try:
+            yield
+        except (RefusedError, NumericalError) as error:
+            if self.as_json:
+                status = "refused" if isinstance(error, RefusedError) else "failed"
+                found = {
+                    "schema": "gcar-result/1",
+                    "status": status,
+                    "sentence": str(error),
+                    "exit_code": error.exit_code,
+                }
+                click.echo(json.dumps(found))
+            raise
 
 
-def limit_threads(threads: int | None) -> None:
-    """Hold every numerical library of this process to ``threads``; before they are imported."""
-    if threads is None:
-        return
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
-    import cv2
+@dataclasses.dataclass(frozen=True)
+class EngineChoice:
+    """Which engine does the work: model (None for the shipped one) and threads."""
 
-    cv2.setNumThreads(threads)
+    model: str | None
+    threads: int | None
 
+    def limit_threads(self) -> None:
+        """Hold every numerical library of this process; before they are imported."""
+        if self.threads is None:
+            return
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ[name] = str(self.threads)
+        import cv2
 
-def output_options(function: _Function) -> _Function:
-    """Add -v, --quiet and --json."""
-    for option in (
-        click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout."),
-        click.option("--quiet", is_flag=True, help="Neither progress nor warnings."),
-        click.option("-v", "--verbose", is_flag=True, help="Say more on stderr."),
-    ):
-        function = option(function)
-    return function
+        cv2.setNumThreads(self.threads)
 
+    def engine(self, order: Order) -> Engine:
+        """Return an engine set up as an order chooses."""
+        from gcar_deploy.config import RunOptions
+        from gcar_deploy.engine import Engine
 
-def engine_options(function: _Function) -> _Function:
-    """Add the options that choose how a tree is reconstructed, and for how long."""
-    deadline = click.option(
-        "--deadline",
-        type=click.FloatRange(min=0, min_open=True),
-        default=None,
-        metavar="SECONDS",
-        help="End the refinement with what it has after so long.",
-    )
-    return predictor_options(deadline(function))
+        options = order.options(RunOptions())
+        return Engine(self.model, threads=self.threads, options=options)
 
 
-def predictor_options(function: _Function) -> _Function:
-    """Add the options that choose how a tree is reconstructed."""
-    for option in (
-        click.option(
-            "--threads", type=click.IntRange(1, 256), default=None, help="At most so many."
+def talk_options(*wanted: str) -> Callable[[_Function], Any]:
+    """Add --verbose, --quiet, --json (all, or those named); they come as the argument ``talk``."""
+    known = {
+        "as_json": click.option(
+            "--json", "as_json", is_flag=True, help="Print one JSON object on stdout."
         ),
-        click.option(
-            "--refiner",
-            type=click.Choice(["tube", "paper", "none"]),
-            default="tube",
-            show_default=True,
-            help="How the tree is fitted to the pictures.",
-        ),
-        click.option("--model", type=click.Path(), default=None, help="ONNX file; spec beside it."),
-        click.option(
-            "--predictor",
-            type=click.Choice(["auto", "multi", "single", "none"]),
-            default="auto",
-            show_default=True,
-            help="Who decides depth: a model, or none (the visual hull is thinned).",
-        ),
-    ):
-        function = option(function)
-    return function
+        "quiet": click.option("--quiet", is_flag=True, help="Neither progress nor warnings."),
+        "verbose": click.option("-v", "--verbose", is_flag=True, help="Say more on stderr."),
+    }
+    return gathered("talk", Talk, {k: o for k, o in known.items() if k in wanted or not wanted})
 
 
-def dicom_options(function: _Function) -> _Function:
-    """Add what a DICOM file may leave open; arguments ``frame``, ``spacing``, ``sod``."""
-    for option in (
-        click.option(
-            "--sod",
-            type=click.FloatRange(300, 5000),
-            default=None,
-            metavar="MM",
-            help="DICOM without it: source to isocentre.",
-        ),
-        click.option(
-            "--pixel-spacing",
-            "spacing",
-            type=click.FloatRange(0.02, 10),
-            default=None,
-            metavar="MM",
-            help="DICOM without it: pixel spacing at the detector.",
-        ),
-        click.option(
-            "--frame",
-            default="auto",
-            show_default=True,
-            metavar="N|auto",
-            help="DICOM: frame of the run, from 1; one for all files, or 7,12 for each.",
-        ),
-    ):
-        function = option(function)
-    return function
+def engine_options(function: _Function) -> Any:
+    """Add --model and --threads; they come as the argument ``engine``."""
+    model = click.option("--model", type=click.Path(), help="ONNX file; spec beside it.")
+    threads = click.option("--threads", type=click.IntRange(1, 256), help="At most so many.")
+    return gathered("engine", EngineChoice, {"threads": threads, "model": model})(function)
 
 
-def chosen_dicom(frame: str, spacing: float | None, sod: float | None) -> Any:
-    """Return DicomOptions; a wrong ``--frame`` is a UsageError."""
-    from gcar_deploy.config import DicomOptions
-    from gcar_deploy.errors import UsageError
+def gathered(
+    name: str, make: Callable[..., Any], options: Mapping[str, Callable[[Any], Any]]
+) -> Callable[[_Function], Any]:
+    """Add options whose values come as one argument ``name``, made by ``make``."""
 
-    frames: list[int | None] = []
-    for word in frame.split(","):
-        text = word.strip()
-        if text != "auto" and not (text.isascii() and text.isdigit() and len(text) < 7):
-            raise UsageError(f"--frame {frame[:40]!r} must be auto, a number, or one for each file")
-        frames.append(None if text == "auto" else int(text))
-    return DicomOptions(frames=tuple(frames), pixel_spacing_mm=spacing, sod_mm=sod)
+    def decorate(function: _Function) -> Any:
+        @functools.wraps(function)
+        def wrapper(**values: Any) -> Any:
+            own = {key: values.pop(key) for key in options}
+            return function(**{name: make(**own)}, **values)
+
+        command: Any = wrapper
+        for option in options.values():
+            command = option(command)
+        return command
+
+    return decorate
 
 
 @contextlib.contextmanager
@@ -182,76 +184,3 @@ def needs_extra(extra: str, *packages: str) -> Iterator[None]:
         if (error.name or "").partition(".")[0] not in packages:
             raise
         raise UsageError(f"{error.name} is not installed: pip install 'gcar[{extra}]'") from None
-
-
-def backend_options(function: _Function) -> _Function:
-    """Add what the paper's refiner computes with."""
-    for option in (
-        click.option(
-            "--backend",
-            type=click.Choice(["numpy", "torch"]),
-            default="numpy",
-            show_default=True,
-            help="What the paper's refiner computes with; torch is its twin (extra torch).",
-        ),
-        click.option(
-            "--device",
-            type=click.Choice(["cpu", "cuda"]),
-            default="cpu",
-            show_default=True,
-            help="Where torch computes.",
-        ),
-    ):
-        function = option(function)
-    return function
-
-
-@contextlib.contextmanager
-def refusals_as_json(wanted: bool) -> Iterator[None]:
-    """With --json, a solve that is refused or fails is an object on stdout as well."""
-    from gcar_deploy.errors import NumericalError, RefusedError
-
-    try:
-        yield
-    except (RefusedError, NumericalError) as error:
-        if wanted:
-            status = "refused" if isinstance(error, RefusedError) else "failed"
-            found = {
-                "schema": "gcar-result/1",
-                "status": status,
-                "sentence": str(error),
-                "exit_code": error.exit_code,
-            }
-            click.echo(json.dumps(found))
-        raise
-
-
-def run_options(predictor: str, refiner: str, backend: str = "numpy", device: str = "cpu") -> Any:
-    """Return RunOptions with these choices made.
-
-    Raises
-    ------
-    UsageError
-        A backend for a refiner that has only one, or one that is not there.
-    """
-    import dataclasses
-
-    from gcar_deploy.config import RunOptions
-    from gcar_deploy.errors import UsageError
-
-    if (backend, device) != ("numpy", "cpu"):
-        if refiner != "paper":
-            raise UsageError(
-                f"--backend {backend} --device {device} is for --refiner paper; "
-                f"the refiner {refiner} computes with numpy on cpu"
-            )
-        from gcar_deploy.gaussians.backends import backend_named
-
-        backend_named(backend, device)
-    options = RunOptions()
-    paper = dataclasses.replace(options.refine.paper, backend=backend, device=device)
-    return dataclasses.replace(
-        options,
-        predict=dataclasses.replace(options.predict, predictor=predictor),
-        refine=dataclasses.replace(options.refine, refiner=refiner, paper=paper),
-    )

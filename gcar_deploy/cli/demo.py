@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import time
@@ -11,84 +12,58 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import (
-    ProgressBar,
-    backend_options,
-    engine_options,
-    limit_threads,
-    output_options,
-    run_options,
-    set_up_logging,
-)
+from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, talk_options
+from gcar_deploy.cli.request import METHOD, order_options
+from gcar_deploy.inputs.order import Order
+
+_FOLDER = Path("gcar-demo")
 
 
 @click.command("demo")
-@click.option(
-    "--out",
-    "out_dir",
-    default="gcar-demo",
-    show_default=True,
-    type=click.Path(path_type=Path),
-    help="New folder.",
-)
+@order_options("out", *METHOD, "force")
 @engine_options
-@backend_options
-@click.option("--force", is_flag=True, help="Replace any result of gcar.")
-@output_options
-def demo(
-    out_dir: Path,
-    predictor: str,
-    model: str | None,
-    refiner: str,
-    deadline: float | None,
-    threads: int | None,
-    backend: str,
-    device: str,
-    force: bool,
-    verbose: bool,
-    quiet: bool,
-    as_json: bool,
-) -> None:
+@talk_options()
+def demo(order: Order, engine: EngineChoice, talk: Talk) -> None:
     """Reconstruct a real patient's left coronary tree from two simulated pictures.
 
     The folder holds the pictures to look at (overlay_view1.png, report.html); the table
-    compares the tree with the truth that the pictures were made from. An earlier demo in the
-    folder is replaced.
+    compares the tree with the truth that the pictures were made from. The folder is gcar-demo
+    unless --out names another; an earlier demo in it is replaced.
 
     \b
     Example:
       gcar demo --out demo
     """  # noqa: D301 - click wants a real backspace
     started = time.perf_counter()
-    set_up_logging(verbose, quiet)
-    limit_threads(threads)
+    talk.set_up()
+    engine.limit_threads()
     from gcar_deploy.data.demo_case import demo_case
-    from gcar_deploy.output.folder import check_target
-
-    case = demo_case()
-    force = force or _holds_a_demo(out_dir, case.pictures)
-    check_target(out_dir, force=force)
-    from gcar_deploy.engine import Engine
+    from gcar_deploy.engine import check_target_of, deliver
     from gcar_deploy.measure.metrics import volume_measures
 
-    engine = Engine(
-        model, threads=threads, options=run_options(predictor, refiner, backend, device)
+    case = demo_case()
+    out = order.out or _FOLDER
+    order = dataclasses.replace(
+        order,
+        views=tuple(case.pictures),
+        geometry=case.geometry,
+        out=out,
+        force=order.force or _holds_a_demo(out, case.pictures),
     )
-    with ProgressBar(quiet=quiet) as bar:
-        result = engine.reconstruct(
-            case.pictures, case.geometry, on_progress=bar, deadline_s=deadline
-        )
+    check_target_of(order)
+    with talk.bar() as bar:
+        result = engine.engine(order).reconstruct_order(order, on_progress=bar)
     measures = volume_measures(
-        case.truth(), result.volume, result.grid.spacing_mm, structure=as_json
+        case.truth(), result.volume, result.grid.spacing_mm, structure=talk.as_json
     )
-    result.save(out_dir, force=force)
+    folder = deliver(result, order)
     whole = time.perf_counter() - started
-    if as_json:
+    if talk.as_json:
         found = {name: measure.value for name, measure in measures.items()}
-        out = {"out": str(out_dir), "measures": found, "wall_s": whole, **result.summary()}
+        out = {"out": str(folder), "measures": found, "wall_s": whole, **result.summary()}
         click.echo(json.dumps(out, allow_nan=False))
     else:
-        click.echo("\n".join(lines(result, measures, out_dir, whole)))
+        click.echo("\n".join(lines(result, measures, folder, whole)))
 
 
 def _holds_a_demo(folder: Path, pictures: Sequence[Path]) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gcar_deploy.cli.common import set_up_logging
+from gcar_deploy.cli.common import Talk, talk_options
 
 if TYPE_CHECKING:
     from gcar_deploy.models import Kind
@@ -23,9 +23,8 @@ _SELF_TEST_MM = 1.0
 
 
 @click.command("doctor")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
-def doctor(as_json: bool, verbose: bool) -> None:
+@talk_options("as_json", "verbose")
+def doctor(talk: Talk) -> None:
     """Check this installation: versions, processor, threads, models, a small reconstruction.
 
     \b
@@ -34,9 +33,9 @@ def doctor(as_json: bool, verbose: bool) -> None:
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import GcarError, ModelError
 
-    set_up_logging(verbose, quiet=False)
+    talk.set_up()
     report = examine()
-    click.echo(json.dumps(report, allow_nan=False) if as_json else "\n".join(lines(report)))
+    click.echo(json.dumps(report, allow_nan=False) if talk.as_json else "\n".join(lines(report)))
     unsound = [f"{one['name']}: {one['sentence']}" for one in report["models"] if not one["sound"]]
     if unsound:
         raise ModelError("; ".join(unsound))

@@ -8,7 +8,9 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import chosen_dicom, dicom_options
+from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.request import order_options
+from gcar_deploy.inputs.order import Order
 
 
 @click.group("geometry")
@@ -17,39 +19,50 @@ def geometry() -> None:
 
     \b
     Example:
-      gcar geometry from-dicom run1.dcm run2.dcm > geom.json
+      gcar geometry from-dicom run1.dcm run2.dcm --out geom.json
       gcar geometry show geom.json
     """  # noqa: D301 - click wants a real backspace
 
 
 @geometry.command("from-dicom")
-@click.argument("runs", nargs=-1, type=click.Path(path_type=Path), metavar="RUN1 RUN2 [RUN3 ...]")
-@dicom_options
-def from_dicom(
-    runs: tuple[Path, ...], frame: str, spacing: float | None, sod: float | None
-) -> None:
-    """Print the geometry in the headers of DICOM XA runs as the text of a geom.json.
+@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="RUN1 RUN2 [RUN3 ...]")
+@order_options("frames", "pixel_spacing_mm", "sod_mm")
+@click.option(
+    "--out", "out_file", type=click.Path(path_type=Path), help="New file; else it is printed."
+)
+def from_dicom(order: Order, out_file: Path | None) -> None:
+    """Read the geometry in the headers of DICOM XA runs as the text of a geom.json.
 
     \b
     Example:
-      gcar geometry from-dicom run1.dcm run2.dcm > geom.json
+      gcar geometry from-dicom run1.dcm run2.dcm --out geom.json
     """  # noqa: D301 - click wants a real backspace
+    from gcar_deploy.config import RunOptions
     from gcar_deploy.dicom.scene import read_views
     from gcar_deploy.errors import UsageError
     from gcar_deploy.geometry.scene import scene_to_json
 
-    if len(runs) < 2:
-        raise UsageError(f"{len(runs)} run given; a geometry needs two or more")
-    _, scene, notes = read_views(list(runs), chosen_dicom(frame, spacing, sod))
+    if len(order.views) < 2:
+        raise UsageError(f"{len(order.views)} run given; a geometry needs two or more")
+    if out_file is not None and out_file.exists():
+        raise UsageError(f"{out_file} exists; name a new file")
+    _, scene, notes = read_views(list(order.views), order.options(RunOptions()).dicom)
     for note in notes:
         click.echo(f"gcar: {note}", err=True)
-    click.echo(scene_to_json(scene), nl=False)
+    if out_file is None:
+        click.echo(scene_to_json(scene), nl=False)
+        return
+    try:
+        out_file.write_text(scene_to_json(scene), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{out_file} cannot be written ({error.strerror})") from None
+    click.echo(str(out_file))
 
 
 @geometry.command("show")
 @click.argument("path", type=click.Path(path_type=Path), metavar="GEOM_JSON")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def show(path: Path, as_json: bool) -> None:
+@talk_options("as_json")
+def show(path: Path, talk: Talk) -> None:
     """Say in words what a scene file holds, and what its views cannot see.
 
     \b
@@ -60,7 +73,7 @@ def show(path: Path, as_json: bool) -> None:
     from gcar_deploy.inspection import describe_scene
 
     found = describe_scene(load_scene(path))
-    click.echo(json.dumps(found) if as_json else "\n".join(_lines(found)))
+    click.echo(json.dumps(found) if talk.as_json else "\n".join(_lines(found)))
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

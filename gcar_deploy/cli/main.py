@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import logging
 import os
@@ -47,6 +48,17 @@ class LazyGroup(click.Group):
         module, _ = VERBS[cmd_name]
         command: click.Command = getattr(importlib.import_module(module), cmd_name)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the verb; a misspelt one is told which it may have been."""
+        name = args[0] if args else ""
+        if name and not name.startswith("-") and name not in VERBS:
+            close = difflib.get_close_matches(name[:80], VERBS, n=1, cutoff=0.5)
+            hint = f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(VERBS)}"
+            ctx.fail(f"no verb {name[:80]!r}{hint}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs without importing them."""

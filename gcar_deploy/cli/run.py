@@ -2,115 +2,57 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import (
-    ProgressBar,
-    backend_options,
-    chosen_dicom,
-    dicom_options,
-    engine_options,
-    limit_threads,
-    output_options,
-    refusals_as_json,
-    run_options,
-    set_up_logging,
-)
-from gcar_deploy.cli.hints import given_masks, hint_options, hinted
+from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, talk_options
+from gcar_deploy.cli.request import EXTRA_FILES, METHOD, READING, order_options
+from gcar_deploy.inputs.order import Order, check_views, order_to_json
 
 
 @click.command("run")
 @click.argument(
     "views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 [VIEW3 ...]"
 )
-@click.option(
-    "--geom",
-    type=click.Path(path_type=Path),
-    help="Geometry of the views (JSON); DICOM has its own.",
-)
-@click.option(
-    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="New folder."
-)
+@order_options("out", *METHOD, *READING, "strict", "force", *EXTRA_FILES, "file")
+@click.option("--print-order", is_flag=True, help="Print the order as JSON and do nothing else.")
 @engine_options
-@backend_options
-@dicom_options
-@hint_options
-@click.option("--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6).")
-@click.option("--force", is_flag=True, help="Replace a folder that gcar wrote.")
-@click.option("--glb", is_flag=True, help="Write surface.glb as well.")
-@click.option(
-    "--dicom-stl", is_flag=True, help="Write surface.dcm (DICOM Encapsulated STL) as well."
-)
-@output_options
-def run(
-    views: tuple[Path, ...],
-    geom: Path | None,
-    out_dir: Path,
-    predictor: str,
-    model: str | None,
-    refiner: str,
-    deadline: float | None,
-    threads: int | None,
-    backend: str,
-    device: str,
-    frame: str,
-    spacing: float | None,
-    sod: float | None,
-    strict: bool,
-    force: bool,
-    glb: bool,
-    dicom_stl: bool,
-    verbose: bool,
-    quiet: bool,
-    as_json: bool,
-    **hints: Any,
-) -> None:
+@talk_options()
+def run(order: Order, engine: EngineChoice, talk: Talk, print_order: bool) -> None:
     """Reconstruct a coronary tree from two or more pictures (PNG, TIFF, NPY, DICOM XA).
 
-    Pictures stand in the order of the views in the geometry file; DICOM runs need none.
+    Pictures stand in the order of the views in the geometry file; DICOM runs need none. All that
+    is asked for can be kept as an order, done again, or sent to a worker.
 
     \b
     Example:
       gcar run view1.png view2.png --geom geom.json --out result
       gcar run run1.dcm run2.dcm --out result
+      gcar run run1.dcm run2.dcm --pixel-spacing 0.3 --out result --print-order > order.json
+      gcar run --order order.json --force
     """  # noqa: D301 - click wants a real backspace
-    from gcar_deploy.errors import RefusedError, UsageError
+    talk.set_up()
+    check_views(order)
+    if print_order:
+        # Wherever the text is put, it names the same files.
+        click.echo(order_to_json(order.relative_to(Path.cwd())), nl=False)
+        return
+    engine.limit_threads()
+    from gcar_deploy.engine import check_target_of, deliver
 
-    set_up_logging(verbose, quiet)
-    if len(views) < 2:
-        raise UsageError(f"{len(views)} picture given; gcar run needs two or more")
-    limit_threads(threads)
-    from gcar_deploy.output.folder import check_target
-
-    check_target(out_dir, force=force, inputs=(*views, *([geom] if geom else [])))
-    from gcar_deploy.engine import Engine
-    from gcar_deploy.output.bundle import check_extras
-
-    extras = [name for name, wanted in (("glb", glb), ("dicom-stl", dicom_stl)) if wanted]
-    check_extras(extras)
-    options = run_options(predictor, refiner, backend, device)
-    options = dataclasses.replace(options, dicom=chosen_dicom(frame, spacing, sod))
-    options = hinted(options, hints)
-    engine = Engine(model, threads=threads, options=options)
-    with refusals_as_json(as_json), ProgressBar(quiet=quiet) as bar:
-        result = engine.reconstruct(
-            list(views), geom, masks=given_masks(hints), on_progress=bar, deadline_s=deadline
-        )
-    for note in () if quiet else result.notes:
-        click.echo(f"gcar: {note}", err=True)
-    if strict and result.status != "ok":
-        with refusals_as_json(as_json):
-            raise RefusedError(f"degraded, and --strict was given: {result.quality.sentence}")
-    result.save(out_dir, force=force, extras=extras)
-    if as_json:
-        click.echo(json.dumps({"out": str(out_dir), **result.summary()}, allow_nan=False))
+    check_target_of(order)
+    with talk.refusals():
+        with talk.bar() as bar:
+            result = engine.engine(order).reconstruct_order(order, on_progress=bar)
+        talk.note(result.notes)
+        folder = deliver(result, order)
+    if talk.as_json:
+        click.echo(json.dumps({"out": str(folder), **result.summary()}, allow_nan=False))
     else:
-        click.echo("\n".join(summary_lines(result, out_dir)))
+        click.echo("\n".join(summary_lines(result, folder)))
 
 
 def summary_lines(result: Any, out_dir: Path) -> list[str]:

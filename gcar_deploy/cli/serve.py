@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import secrets
@@ -13,74 +14,87 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import (
-    limit_threads,
+    EngineChoice,
+    Talk,
+    engine_options,
+    gathered,
     needs_extra,
-    predictor_options,
-    run_options,
-    set_up_logging,
+    talk_options,
 )
+from gcar_deploy.cli.request import order_options
+from gcar_deploy.inputs.order import Order
 
 _LEAST_TOKEN = 16
 TOKEN_VARIABLE = "GCAR_TOKEN"  # noqa: S105 - the name of a variable
 
 
+@dataclasses.dataclass(frozen=True)
+class Door:
+    """How host programs reach the worker."""
+
+    stdio: bool
+    port: int
+    folder: Path | None
+    token_file: Path | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What the worker takes upon itself."""
+
+    limit: float
+    body_mib: int
+    waiting: int
+    memory_mib: int
+
+
+_DOOR = {
+    "token_file": click.option(
+        "--token-file", type=click.Path(path_type=Path),
+        help=f"Holds the token; else {TOKEN_VARIABLE}, else one is made and printed once.",
+    ),
+    "folder": click.option(
+        "--folder", type=click.Path(path_type=Path),
+        help="Orders may name files in this folder and put results there.",
+    ),
+    "port": click.option(
+        "--port", type=click.IntRange(0, 65535), default=0, help="Of 127.0.0.1; 0 takes a free one."
+    ),
+    "stdio": click.option(
+        "--stdio", is_flag=True,
+        help="JSON-RPC 2.0 lines on standard input and output; no network.",
+    ),
+}  # fmt: skip
+_LIMITS = {
+    "memory_mib": click.option(
+        "--memory-mib", type=click.IntRange(min=1024), default=8192, show_default=True,
+        help="Address space of the worker, MiB: a job that needs more fails, the worker lives on.",
+    ),
+    "waiting": click.option(
+        "--queue", "waiting", type=click.IntRange(1, 1000), default=32, show_default=True,
+        help="Jobs that may wait.",
+    ),
+    "body_mib": click.option(
+        "--body-mib", type=click.IntRange(1, 4096), default=256, show_default=True,
+        help="The largest request, MiB.",
+    ),
+    "limit": click.option(
+        "--limit", type=click.FloatRange(min=0, min_open=True), default=120.0, show_default=True,
+        metavar="SECONDS", help="The longest deadline of a job.",
+    ),
+}  # fmt: skip
+
+
 @click.command("serve")
-@click.option(
-    "--stdio", is_flag=True, help="JSON-RPC 2.0 lines on standard input and output; no network."
-)
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=0, help="Of 127.0.0.1; 0 takes a free one."
-)
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    default=None,
-    help="Orders may name files in this folder and put results there.",
-)
-@click.option(
-    "--token-file",
-    type=click.Path(path_type=Path),
-    default=None,
-    help=f"Holds the token; else {TOKEN_VARIABLE}, else one is made and printed once.",
-)
-@click.option(
-    "--limit",
-    type=click.FloatRange(min=0, min_open=True),
-    default=120.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="The longest deadline of a job.",
-)
-@click.option(
-    "--body-mib", type=click.IntRange(1, 4096), default=256, show_default=True,
-    help="The largest request, MiB.",
-)  # fmt: skip
-@click.option(
-    "--queue", "waiting", type=click.IntRange(1, 1000), default=32, show_default=True,
-    help="Jobs that may wait.",
-)  # fmt: skip
-@click.option(
-    "--memory-mib", type=click.IntRange(min=1024), default=8192, show_default=True,
-    help="Address space of the worker, MiB: a job that needs more fails, the worker lives on.",
-)  # fmt: skip
-@predictor_options
-@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
-def serve(
-    stdio: bool,
-    port: int,
-    folder: Path | None,
-    token_file: Path | None,
-    limit: float,
-    body_mib: int,
-    waiting: int,
-    memory_mib: int,
-    predictor: str,
-    model: str | None,
-    refiner: str,
-    threads: int | None,
-    verbose: bool,
-) -> None:
+@gathered("door", Door, _DOOR)
+@gathered("limits", Limits, _LIMITS)
+@order_options("predictor", "refiner", "segmenter", "pose")
+@engine_options
+@talk_options("verbose")
+def serve(door: Door, limits: Limits, order: Order, engine: EngineChoice, talk: Talk) -> None:
     """Keep an engine warm and reconstruct what host programs send.
+
+    Predictor, refiner, segmenter and pose hold for orders that do not name their own.
 
     HTTP with JSON on 127.0.0.1 alone, behind a bearer token (GET /openapi.json describes it),
     or JSON lines with --stdio. Ctrl-C or SIGTERM ends it: open jobs are cancelled.
@@ -89,37 +103,36 @@ def serve(
     Example:
       gcar serve --port 8790 --folder cases
     """  # noqa: D301 - click wants a real backspace
-    set_up_logging(verbose, quiet=False)
-    limit_threads(threads)
+    talk.set_up()
+    engine.limit_threads()
     token = None
-    if not stdio:
-        token = read_token(token_file)
+    if not door.stdio:
+        token = read_token(door.token_file)
         with needs_extra("serve", "flask", "waitress", "werkzeug"):
             # Found out before the engine takes its seconds.
             import gcar_deploy.worker.http  # noqa: F401
-    from gcar_deploy.engine import Engine
     from gcar_deploy.worker.folder import AllowedFolder
     from gcar_deploy.worker.jobs import JobQueue
     from gcar_deploy.worker.orders import do_order
 
-    allowed = None if folder is None else AllowedFolder(folder)
+    allowed = None if door.folder is None else AllowedFolder(door.folder)
     # Only what will serve changes its process: a refused call leaves it as it was.
-    limit_memory(memory_mib)
+    limit_memory(limits.memory_mib)
     # SIGTERM, like Ctrl-C, ends a server in good order.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    engine = Engine(model, threads=threads, options=run_options(predictor, refiner))
-    engine.warmup()
+    warm = engine.engine(order)
+    warm.warmup()
 
     def work(order: Any, on_progress: Any, cancel: Any) -> Any:
-        return do_order(engine, order, on_progress, cancel, limit_s=limit)
+        return do_order(warm, order, on_progress, cancel, limit_s=limits.limit)
 
     def make_queue(on_change: Any = None) -> JobQueue:
-        return JobQueue(work, most_waiting=waiting, on_change=on_change)
+        return JobQueue(work, most_waiting=limits.waiting, on_change=on_change)
 
-    if stdio:
+    if door.stdio:
         _serve_lines(make_queue, allowed)
     else:
-        _serve_http(make_queue(), allowed, token, port, body_mib)
+        _serve_http(make_queue(), allowed, token, door.port, limits.body_mib)
 
 
 def _serve_lines(make_queue: Any, allowed: Any) -> None:

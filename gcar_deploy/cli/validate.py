@@ -3,47 +3,39 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import chosen_dicom, dicom_options
-from gcar_deploy.cli.hints import hinted, reading_options
+from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.request import READING, order_options
+from gcar_deploy.inputs.order import Order
 
-EXAMPLE = "Example:\n\n  gcar validate view1.png view2.png --geom geom.json"
 
-
-@click.command(epilog=EXAMPLE, short_help="Check pictures and geometry without reconstructing.")
-@click.argument("pictures", nargs=-1, required=True, type=click.Path(dir_okay=False))
-@click.option("--geom", type=click.Path(dir_okay=False), help="Scene file; DICOM has its own.")
-@dicom_options
-@reading_options
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def validate(
-    pictures: tuple[str, ...],
-    geom: str | None,
-    frame: str,
-    spacing: float | None,
-    sod: float | None,
-    as_json: bool,
-    **hints: Any,
-) -> None:
-    """Check PICTURES and the scene file without reconstructing.
+@click.command(short_help="Check pictures and geometry without reconstructing.")
+@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 ...")
+@order_options(*READING, "file")
+@talk_options("as_json")
+def validate(order: Order, talk: Talk) -> None:
+    """Check pictures and their geometry without reconstructing.
 
     Says how far apart the views are, how they magnify, how much of the volume each covers,
     whether they can show the same tree, and what ``gcar run`` would refuse and why; ends with
     the exit code that ``gcar run`` would give.
-    """
+
+    \b
+    Example:
+      gcar validate view1.png view2.png --geom geom.json
+    """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.config import RunOptions
-    from gcar_deploy.errors import GcarError
     from gcar_deploy.inspection import inspect_files
 
-    options = hinted(RunOptions(dicom=chosen_dicom(frame, spacing, sod)), hints)
-    found = inspect_files(pictures, geom, options)
-    click.echo(json.dumps(found.to_dict()) if as_json else "\n".join(_lines(found)))
+    options = order.options(RunOptions())
+    found = inspect_files(order.views, order.geometry, options, order.masks)
+    click.echo(json.dumps(found.to_dict()) if talk.as_json else "\n".join(_lines(found)))
     if found.error is not None:
-        error: GcarError = found.error
-        raise error
+        raise found.error
 
 
 def _lines(found: Any) -> list[str]:

@@ -67,6 +67,17 @@ def check_options(options: Any, name: str = "") -> None:
         raise UsageError(f"option {name}{wrong}")
 
 
+def check_field(kind: type, field: str, value: Any) -> None:
+    """Refuse what ``kind``, a dataclass of options, would refuse as its ``field``.
+
+    Raises
+    ------
+    UsageError
+        One line with the field, its value and what it may be.
+    """
+    _check(field, value, _hints(kind)[field])
+
+
 @functools.cache
 def _hints(kind: Any) -> dict[str, Any]:
     known = typing.get_type_hints(kind, include_extras=True)

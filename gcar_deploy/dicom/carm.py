@@ -120,7 +120,7 @@ def _distances(
         hint = f" (its magnification factor suggests {sdd / factor:.0f})" if factor else ""
         raise GeometryError(
             f"{tag('DistanceSourceToPatient')}, source to isocentre, is missing; "
-            f"give it with --sod MM{hint}"
+            f"give it with --sod MM (sod_mm of an order){hint}"
         )
     if sod and options.sod_mm is not None and abs(sod - options.sod_mm) > 0.5:
         notes.append(f"says {sod:g} mm source to isocentre itself; --sod is not used for it")
@@ -146,7 +146,7 @@ def _spacing(
         )
         raise GeometryError(
             f"{tag('ImagerPixelSpacing')}, pixel spacing at the detector, is missing; "
-            f"give it with --pixel-spacing MM{why}"
+            f"give it with --pixel-spacing MM (pixel_spacing_mm of an order){why}"
         )
     if own is None:
         return float(given or 0.0), float(given or 0.0)

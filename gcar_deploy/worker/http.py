@@ -6,6 +6,7 @@ receives a whole request, within its limits of size and time, before a thread se
 
 from __future__ import annotations
 
+import dataclasses
 import hmac
 import logging
 import shutil
@@ -22,20 +23,13 @@ from werkzeug.exceptions import HTTPException
 
 from gcar_deploy import __version__
 from gcar_deploy.errors import GcarError, GeometryError, UsageError
+from gcar_deploy.files import text_of
 from gcar_deploy.geometry.fields import read_json
+from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
-from gcar_deploy.worker.orders import (
-    KEYS,
-    MOST_VIEWS,
-    Order,
-    check_keys,
-    common_fields,
-    new_scratch,
-    parse_order,
-    suffix_of,
-)
+from gcar_deploy.worker.orders import Received, new_scratch, placed, receive, scratch_file
 
 _log = logging.getLogger(__name__)
 LOOPBACK = "127.0.0.1"
@@ -68,7 +62,7 @@ def create_app(
     app.config.update(
         MAX_CONTENT_LENGTH=body_mib * 2**20,
         MAX_FORM_MEMORY_SIZE=_MOST_FIELDS,
-        MAX_FORM_PARTS=MOST_VIEWS + len(KEYS) + 2,
+        MAX_FORM_PARTS=2 * MOST_VIEWS + 2,
         TRUSTED_HOSTS=_HOSTS,
     )
     app.json.sort_keys = False  # type: ignore[attr-defined]
@@ -87,12 +81,11 @@ def create_app(
 
     @app.post("/v1/reconstruct")
     def reconstruct() -> Any:
-        order = _order(folder)
+        received = _received(folder)
         try:
-            job = queue.submit(order)
+            job = queue.submit(received)
         except QueueFullError:
-            if order.scratch is not None:
-                shutil.rmtree(order.scratch, ignore_errors=True)
+            received.clean()
             raise
         _wait(job, waiters)
         place = url_for("job_of", job_id=job.id)
@@ -205,7 +198,7 @@ def _shown(job: Job, queue: JobQueue) -> dict[str, Any]:
         "ahead": queue.ahead(job),
         "seconds": job.seconds,
         "error": None if job.error is None else {"message": job.error, "exit_code": job.exit_code},
-        "out": None if job.order.out is None else str(job.order.out),
+        "out": None if job.received.private else str(job.order.out),
         "files": _files(job),
         "result": job.summary,
     }
@@ -217,66 +210,94 @@ def _files(job: Job) -> list[str]:
     return sorted(path.name for path in job.folder.iterdir() if path.is_file())
 
 
-def _order(folder: AllowedFolder | None) -> Order:
+def _received(folder: AllowedFolder | None) -> Received:
+    """Read the order of a request; without ``out`` its result stays in the private folder."""
     if request.mimetype == "application/json":
         values = _strict(request.get_data(cache=False), "the body")
         if folder is None:
             raise UsageError("this worker takes uploads alone: it was started without --folder")
-        return parse_order(values, folder)
-    if request.mimetype == "multipart/form-data":
-        return _uploaded(folder)
-    raise UsageError("send multipart/form-data or application/json")
+        found = receive(values, folder)
+    elif request.mimetype == "multipart/form-data":
+        found = _uploaded(folder)
+    else:
+        raise UsageError("send multipart/form-data or application/json")
+    if found.order.out is not None or found.scratch is None:
+        return found
+    order = dataclasses.replace(found.order, out=found.scratch / "result")
+    return dataclasses.replace(found, order=order)
 
 
-def _uploaded(folder: AllowedFolder | None) -> Order:
-    """Read an order of parts ``view`` (in order), and at will ``geometry`` and ``options``."""
-    files: list[FileStorage] = request.files.getlist("view")
-    unknown = (set(request.files) | set(request.form)) - {"view", "geometry", "options"}
-    if unknown:
-        raise UsageError(f"unknown part {sorted(unknown)[0]!r}; known: view, geometry, options")
-    if not 2 <= len(files) <= MOST_VIEWS:
-        raise UsageError(f"{len(files)} parts named view; 2 .. {MOST_VIEWS} are taken")
-    options = check_keys(_json("options", "{}"))
-    if "views" in options or "geometry" in options:
-        raise UsageError("options: views and geometry are parts of their own")
+def _uploaded(folder: AllowedFolder | None) -> Received:
+    """Read an order of parts: ``view`` (in order), and at will masks, geometry and options."""
+    options = _json("options", "{}")
+    if not isinstance(options, dict):
+        raise UsageError("part options must be an object")
+    if options.keys() & {"views", "geometry", "masks"}:
+        raise UsageError("options: views, geometry and masks are parts of their own")
     # Only DICOM views may do without; the engine says so.
     geometry = _json("geometry", "null")
     if not isinstance(geometry, (dict, type(None))):
         raise UsageError("part geometry must be the content of a geom.json")
-    if options.get("out") is not None and folder is None:
-        raise UsageError("out needs a worker that was started with --folder")
-    common = common_fields(options, folder)
+    views, masks = _uploads()
+    order = parse_order(
+        {
+            **options,
+            "geometry": geometry,
+            "views": [str(scratch_file(Path(), name, f.filename)) for name, f in views.items()],
+            "masks": {
+                name[4:]: str(scratch_file(Path(), name, f.filename)) for name, f in masks.items()
+            },
+        }
+    )
+    if order.out is not None:
+        if folder is None:
+            raise UsageError("out needs a worker that was started with --folder")
+        order = placed(order, folder)
+    files = views | masks
     scratch = new_scratch()
+
+    def saved(name: str, path: Path) -> Path:
+        files[name].save(scratch / path)
+        return scratch / path
+
     try:
-        views = []
-        for number, file in enumerate(files, start=1):
-            path: Path = scratch / f"view{number}{suffix_of(file.filename or '')}"
-            file.save(path)
-            views.append(path)
+        return Received(order.with_files(saved), scratch)
     except BaseException:
         shutil.rmtree(scratch, ignore_errors=True)
         raise
-    return Order(views=tuple(views), geometry=geometry, scratch=scratch, **common)
+
+
+def _uploads() -> tuple[dict[str, FileStorage], dict[str, FileStorage]]:
+    """Return the pictures and the masks of a form: ``view1`` ... and ``mask1`` ... -> upload."""
+    views = {f"view{k}": file for k, file in enumerate(request.files.getlist("view"), start=1)}
+    names = [f"mask{k}" for k in range(1, MOST_VIEWS + 1)]
+    masks = {name: request.files[name] for name in names if name in request.files}
+    unknown = (set(request.files) | set(request.form)) - {"view", "geometry", "options", *masks}
+    if unknown:
+        raise UsageError(
+            f"unknown part {sorted(unknown)[0]!r}; known: view, geometry, options, mask1 ..."
+        )
+    if not 2 <= len(views) <= MOST_VIEWS:
+        raise UsageError(f"{len(views)} parts named view; 2 .. {MOST_VIEWS} are taken")
+    return views, masks
 
 
 def _json(part: str, default: str) -> Any:
     """JSON of a form field, or of a small file of that name."""
-    text = request.form.get(part, default)
+    data = request.form.get(part, default).encode("utf-8", "surrogatepass")
     if part in request.files:
         data = request.files[part].stream.read(_MOST_FIELDS + 1)
         if len(data) > _MOST_FIELDS:
             raise UsageError(f"part {part}: larger than {_MOST_FIELDS >> 20} MiB")
-        text = data.decode("utf-8", "replace")
-    return _strict(text.encode("utf-8", "surrogatepass"), f"part {part}")
+    return _strict(data, f"part {part}")
 
 
 def _strict(data: bytes, what: str) -> Any:
     """JSON without NaN or repeated keys."""
     try:
-        return read_json(data.decode("utf-8"), _MOST_FIELDS)
-    except (UnicodeDecodeError, GeometryError) as error:
-        reason = error if isinstance(error, GeometryError) else "not UTF-8"
-        raise UsageError(f"{what} is not JSON ({reason})") from None
+        return read_json(text_of(data), _MOST_FIELDS)
+    except (ValueError, GeometryError) as error:
+        raise UsageError(f"{what} is not JSON ({error})") from None
 
 
 def listen(app: Flask, port: int) -> Any:

@@ -6,7 +6,6 @@ import collections
 import dataclasses
 import logging
 import secrets
-import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -14,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import CancelledError, GcarError, RefusedError
-from gcar_deploy.worker.orders import Order
+from gcar_deploy.inputs.order import Order
+from gcar_deploy.worker.orders import Received
 
 _log = logging.getLogger(__name__)
 QUEUED, RUNNING, DONE = "queued", "running", "done"
@@ -36,7 +36,7 @@ class Job:
     Attributes
     ----------
     id : str, unguessable
-    order : Order
+    received : the order and its private files
     state : ``queued``, ``running``, ``done``, ``refused``, ``failed`` or ``cancelled``
     stage, share : what is being done, and the share of the work done, 0 .. 1
     summary : content of ``result.json`` once done
@@ -46,7 +46,7 @@ class Job:
     """
 
     id: str
-    order: Order
+    received: Received
     state: str = QUEUED
     stage: str = ""
     share: float = 0.0
@@ -57,6 +57,11 @@ class Job:
     seconds: float | None = None
     finished: threading.Event = dataclasses.field(default_factory=threading.Event, repr=False)
     wish_to_stop: threading.Event = dataclasses.field(default_factory=threading.Event, repr=False)
+
+    @property
+    def order(self) -> Order:
+        """What is to be done."""
+        return self.received.order
 
     @property
     def open(self) -> bool:
@@ -92,15 +97,15 @@ class JobQueue:
         self._thread = threading.Thread(target=self._loop, name="gcar-worker", daemon=True)
         self._thread.start()
 
-    def submit(self, order: Order) -> Job:
-        """Put an order at the end of the queue.
+    def submit(self, received: Received) -> Job:
+        """Put an order at the end of the queue; its private files now belong to the job.
 
         Raises
         ------
         QueueFullError
             Too many wait already, or the queue is closing.
         """
-        job = Job(id=secrets.token_urlsafe(12), order=order)
+        job = Job(id=secrets.token_urlsafe(12), received=received)
         with self._changed:
             if self._closing:
                 raise QueueFullError("the worker is shutting down")
@@ -144,7 +149,7 @@ class JobQueue:
         """Drop a finished job with its private files."""
         with self._changed:
             self._jobs.pop(job.id, None)
-        _clean(job)
+        job.received.clean()
 
     def close(self) -> None:
         """Cancel everything and wait for the working thread."""
@@ -203,7 +208,7 @@ class JobQueue:
 
     def _finish(self, job: Job) -> None:
         if job.state != DONE:
-            _clean(job)
+            job.received.clean()
         job.finished.set()
         self._tell(job)
         with self._changed:
@@ -214,8 +219,3 @@ class JobQueue:
     def _tell(self, job: Job) -> None:
         if self._on_change is not None:
             self._on_change(job)
-
-
-def _clean(job: Job) -> None:
-    if job.order.scratch is not None:
-        shutil.rmtree(job.order.scratch, ignore_errors=True)

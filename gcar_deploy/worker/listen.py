@@ -20,8 +20,9 @@ from pynetdicom import AE, evt
 
 from gcar_deploy.dicom.header import CLASSIC, ENHANCED, SYNTAXES
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.inputs.order import MOST_VIEWS, Order
 from gcar_deploy.worker.jobs import Job, JobQueue
-from gcar_deploy.worker.orders import MOST_VIEWS, Order, new_scratch
+from gcar_deploy.worker.orders import Received, new_scratch
 
 _log = logging.getLogger(__name__)
 LOOPBACK = "127.0.0.1"
@@ -134,17 +135,13 @@ class Listener:
                 self._order(uid, study)
 
     def _order(self, uid: str, study: Study) -> None:
-        order = Order(
-            views=tuple(study.runs.values()),
-            geometry=None,
-            out=self._free(uid),
-            scratch=study.scratch,
-        )
+        order = Order(views=tuple(study.runs.values()), out=self._free(uid))
+        received = Received(order, study.scratch)
         try:
-            self._queue.submit(order)
+            self._queue.submit(received)
         except GcarError as error:
             _log.error("study %s: %s", uid, error)
-            shutil.rmtree(study.scratch, ignore_errors=True)
+            received.clean()
 
     def _free(self, uid: str) -> Path:
         path, number = self._out / uid, 1

@@ -1,6 +1,6 @@
 """JSON lines on standard input and output: JSON-RPC 2.0, one message a line.
 
-Methods: ``reconstruct`` (params as ``orders.parse_order``; answered when finished),
+Methods: ``reconstruct`` (params as ``orders.receive``; answered when finished),
 ``cancel`` ({"id": id of the request}), ``health``, ``shutdown``. Notifications: ``progress``
 ({"id", "stage", "share"}). Error codes above 0 are the exit codes of ``gcar run``.
 """
@@ -8,7 +8,6 @@ Methods: ``reconstruct`` (params as ``orders.parse_order``; answered when finish
 from __future__ import annotations
 
 import json
-import shutil
 import threading
 from collections.abc import Callable
 from typing import IO, Any
@@ -19,7 +18,7 @@ from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue
-from gcar_deploy.worker.orders import parse_order
+from gcar_deploy.worker.orders import receive
 
 #: characters of one message
 MOST_CHARACTERS = 4 * 2**20
@@ -101,16 +100,15 @@ class LineServer:
         return True
 
     def _reconstruct(self, ident: Any, params: Any) -> None:
-        order = parse_order(params, self._folder)
-        if order.out is None:
-            if order.scratch is not None:
-                shutil.rmtree(order.scratch, ignore_errors=True)
+        received = receive(params, self._folder)
+        if received.order.out is None:
+            received.clean()
             raise UsageError("out is missing: name the folder for the result")
         # The job may be over before submit returns.
         with self._asking:
             if ident in self._request_of.values():
                 raise UsageError(f"id {ident!r} is in use")
-            self._request_of[self._queue.submit(order).id] = ident
+            self._request_of[self._queue.submit(received).id] = ident
 
     def _cancel(self, params: Any) -> bool:
         wanted = params.get("id") if isinstance(params, dict) else None

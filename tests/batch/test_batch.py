@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import html.parser
 import json
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
 from gcar_deploy.batch import pools, work
 from gcar_deploy.batch.batch import run_batch
-from gcar_deploy.batch.cases import read_cases
+from gcar_deploy.batch.cases import read_cases as cases_of
 from gcar_deploy.batch.summary import summary_csv, summary_html
+from gcar_deploy.batch.work import BatchEngine
 from gcar_deploy.errors import UsageError
+from gcar_deploy.inputs.order import Order
 from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
 
-OPTIONS = {"predictor": "none", "refiner": "tube", "model": None, "threads": 1, "deadline_s": None}
+ENGINE = BatchEngine(threads=1)
+LIKE = Order(predictor="none")
+
+
+def read_cases(table, like=LIKE):
+    return cases_of(table, like)
 
 
 @pytest.fixture
@@ -79,30 +86,33 @@ def test_an_interrupted_batch_goes_on(table, tmp_path, monkeypatch):
     cases, out = read_cases(table), tmp_path / "out"
     first = rows_without_processes(monkeypatch, kill=("missing",))
     with pytest.raises(KeyboardInterrupt):
-        run_batch(cases, out, OPTIONS)
+        run_batch(cases, out, ENGINE)
     assert first == ["good-1", "twice"] and not (out / "summary.csv").exists()
     second = rows_without_processes(monkeypatch)
     told = []
-    rows = run_batch(cases, out, OPTIONS, on_case=lambda *what: told.append(what[:2]))
+    rows = run_batch(cases, out, ENGINE, on_case=lambda *what: told.append(what[:2]))
     assert second == ["missing", "bad-geometry", "three", "good-2"]
     assert told == [(2, 6), (3, 6), (4, 6), (5, 6), (6, 6)]
     assert [row["case"] for row in rows] == [case.name for case in cases]
     third = rows_without_processes(monkeypatch)
-    assert run_batch(cases, out, OPTIONS) == rows and third == []
+    assert run_batch(cases, out, ENGINE) == rows and third == []
     again = rows_without_processes(monkeypatch)
-    run_batch(cases, out, OPTIONS, force=True)
+    run_batch(cases, out, ENGINE, force=True)
     assert again == ["missing", "bad-geometry", "three"]
 
 
 def test_a_changed_case_is_not_passed_off_as_the_old_one(table, tmp_path, monkeypatch):
     rows_without_processes(monkeypatch)
     cases = [case for case in read_cases(table) if case.name in ("twice", "bad-geometry")]
-    run_batch(cases, tmp_path / "out", OPTIONS)
+    run_batch(cases, tmp_path / "out", ENGINE)
     with pytest.raises(UsageError, match=r"'twice'.*--force"):
-        run_batch(cases, tmp_path / "out", {**OPTIONS, "refiner": "none"})
+        run_batch(cases, tmp_path / "out", BatchEngine(threads=2))
+    unrefined = read_cases(table, Order(predictor="none", refiner="none"))
+    with pytest.raises(UsageError, match=r"'twice'.*--force"):
+        run_batch([c for c in unrefined if c.name == "twice"], tmp_path / "out", ENGINE)
     (tmp_path / "bad.json").write_text("{}")
     with pytest.raises(UsageError, match="bad-geometry"):
-        run_batch(cases, tmp_path / "out", OPTIONS)
+        run_batch(cases, tmp_path / "out", ENGINE)
 
 
 def suicidal(job):
@@ -121,9 +131,8 @@ def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
     monkeypatch.setattr(pools, "run_case", suicidal)
     jobs = [
         work.BatchJob(
-            case=name, views=(), geometry="", out="", marker=str(tmp_path / name),
-            fingerprint="f", predictor="none", refiner="tube", model=None, threads=None,
-            deadline_s=None,
+            case=name, order=Order(), engine=BatchEngine(), marker=str(tmp_path / name),
+            fingerprint="f",
         )
         for name in ("a", "killer", "b", "c")
     ]  # fmt: skip
@@ -146,7 +155,9 @@ def test_on_a_dask_cluster(table, tmp_path, monkeypatch):
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
         dashboard_address=None, worker_dashboard_address=None,
     ) as cluster:  # fmt: skip
-        rows = run_batch(cases, tmp_path / "out", OPTIONS, scheduler=cluster.scheduler_address)
+        rows = run_batch(
+            cases, tmp_path / "out", ENGINE, pool=pools.Pool(scheduler=cluster.scheduler_address)
+        )
     assert [row["exit_code"] for row in rows] == [0, 3]
     assert (tmp_path / "out" / "good-1" / "result.json").is_file()
 
@@ -154,8 +165,9 @@ def test_on_a_dask_cluster(table, tmp_path, monkeypatch):
 def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(pools, "CONNECT_S", 0.2)
+    absent = pools.Pool(scheduler="tcp://127.0.0.1:9")
     with pytest.raises(UsageError, match="does not answer"):
-        run_batch(read_cases(table), tmp_path / "o", OPTIONS, scheduler="tcp://127.0.0.1:9")
+        run_batch(read_cases(table), tmp_path / "o", ENGINE, pool=absent)
     done = gcar("batch", table, "--out", tmp_path / "p", "--engine", "dask")
     assert done.code == 2 and "--scheduler" in done.err
 
@@ -188,7 +200,7 @@ def test_nothing_of_the_users_is_touched(table, tmp_path):
     out.mkdir()
     (out / "thesis.txt").write_text("x")
     with pytest.raises(UsageError, match="holds no batch"):
-        run_batch(read_cases(table), out, OPTIONS)
+        run_batch(read_cases(table), out, ENGINE)
     assert [p.name for p in out.iterdir()] == ["thesis.txt"]
 
 
@@ -215,7 +227,7 @@ def test_rows_travel_between_processes():
     import pickle
 
     job = work.BatchJob(
-        case="a", views=("v",), geometry="g", out="o", marker=None, fingerprint="f",
-        predictor="none", refiner="tube", model=None, threads=1, deadline_s=None,
+        case="a", order=Order(views=(Path("v"),), geometry=Path("g"), out=Path("o")),
+        engine=BatchEngine(threads=1), marker=None, fingerprint="f",
     )  # fmt: skip
-    assert dataclasses.asdict(pickle.loads(pickle.dumps(job))) == dataclasses.asdict(job)  # noqa: S301
+    assert pickle.loads(pickle.dumps(job)) == job  # noqa: S301

@@ -1,4 +1,4 @@
-"""gcar bench: its table, its picture, and what it says of wrong calls; --backend on other verbs."""
+"""gcar bench: its table, its picture, and what it says of wrong calls."""
 
 from __future__ import annotations
 
@@ -79,8 +79,6 @@ def test_wrong_calls_are_one_line(tmp_path: Path):
     done = gcar("bench", "--out", tmp_path)
     assert done.code == 2 and "bench.csv exists; --force" in done.err
     assert (tmp_path / "bench.csv").read_text() == "mine"
-    done = gcar("demo", "--out", tmp_path / "d", "--backend", "torch")
-    assert done.code == 2 and "--refiner paper" in done.err and not (tmp_path / "d").exists()
 
 
 def test_what_the_workshop_offers_is_declared_and_there():

@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gcar_deploy.cli.hints import parse_landmark
-from gcar_deploy.errors import UsageError
 from gcar_deploy.selftest import tiny_case
 from tests.cli.conftest import gcar
 
@@ -17,16 +15,6 @@ def run(folder, out, *arguments):
         "run", folder / "view1.png", folder / "view2.png", "--geom", folder / "geom.json",
         "--out", out, *arguments,
     )  # fmt: skip
-
-
-def test_landmark_syntax():
-    assert parse_landmark("1,2:3.5,4") == ((1.0, 2.0), (3.5, 4.0))
-    assert parse_landmark("1,2:-:3,4") == ((1.0, 2.0), None, (3.0, 4.0))
-    for wrong in ("", "1,2", "1;2:3,4", "1,2:3,nan", "1,2,3:4,5", "a,b:c,d"):
-        if wrong == "1,2":
-            continue  # one view is refused where the views are known
-        with pytest.raises(UsageError, match="--landmark"):
-            parse_landmark(wrong)
 
 
 def test_a_landmark_and_what_the_result_says_of_it(good_case, tmp_path):
@@ -48,8 +36,10 @@ def test_a_landmark_and_what_the_result_says_of_it(good_case, tmp_path):
     [
         (("--landmark", "1,2"), 2, "1 points for 2 views"),
         (("--landmark", "1,2:900,3"), 2, "outside"),
-        (("--landmark", "1,2:3,4", "--pose", "off"), 2, "--pose off"),
+        (("--landmark", "1,2:3,4", "--pose", "off"), 2, "pose off"),
         (("--mask3", "view1.png"), 2, "views 1 .. 2"),
+        (("--mask", "16:m.png"), 2, "views 1 .. 2"),
+        (("--mask", "17:m.png"), 2, "N:FILE"),
         (("--mask1", "missing.png"), 3, "missing.png"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import shutil
 import subprocess
@@ -9,11 +10,19 @@ import sys
 import time
 from importlib import resources
 
+import click
+import cv2
+import numpy as np
 import pytest
 
 from gcar_deploy.cli import doctor as doctor_verb
 from gcar_deploy.cli import main as entry
 from gcar_deploy.cli.main import VERBS
+from gcar_deploy.cli.main import gcar as gcar_group
+from gcar_deploy.config import ImagingOptions, RunOptions
+from gcar_deploy.data.demo_case import demo_case
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.predict.kinds import MULTI, PREDICTORS
 from tests.cli.conftest import gcar
 
@@ -39,6 +48,35 @@ def test_group_help_names_every_verb_and_version_prints():
         assert f"  {verb} " in done.out
     assert "gcar run view1.png view2.png --geom geom.json --out result" in done.out
     assert gcar("--version").out.startswith("gcar")
+
+
+def leaves(group=gcar_group, *path):
+    """Yield every command with its name's words."""
+    for name in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), name)
+        if isinstance(command, click.Group):
+            yield from leaves(command, *path, name)
+        yield (*path, name), command
+
+
+def test_no_help_shows_clicks_marks():
+    for words, command in leaves():
+        shown = gcar(*words, "--help").out
+        assert "\\b" not in shown and "\b" not in shown, words
+        lines = shown.split("Example:\n")[1].splitlines() if "Example:" in shown else ["  gcar"]
+        assert lines[0].strip().startswith(("gcar ", "storescu ")), words
+        assert len(inspect.signature(inspect.unwrap(command.callback)).parameters) <= 6, words
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [("rnu", "run"), ("valdiate", "validate"), ("docter", "doctor"), ("xyzzy", None)],
+)
+def test_a_misspelt_verb_is_told_which_it_may_be(wrong, meant):
+    done = gcar(wrong, "view1.png")
+    assert done.code == 2 and done.out == "" and len(done.err.splitlines()) == 1
+    said = f"no verb {wrong!r}; did you mean {meant!r}?" if meant else "; known: run, validate"
+    assert said in done.err
 
 
 @pytest.mark.benchmark
@@ -140,6 +178,33 @@ def test_rescaled_pictures_are_taken_and_that_is_said(good_case, tmp_path):
     (case / "geom.json").write_text(json.dumps(data))
     done = gcar(*run_arguments(case, tmp_path / "out"))
     assert done.code == 0 and "0.5 times" in done.err
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+def test_geometry_as_windows_writes_it(good_case, tmp_path, encoding):
+    text = (good_case / "geom.json").read_text()
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    (tmp_path / "geom.json").write_bytes((mark + text).encode(encoding))
+    shown = gcar("geometry", "show", tmp_path / "geom.json", "--json")
+    plain = gcar("geometry", "show", good_case / "geom.json", "--json")
+    assert shown.code == 0 and shown.out == plain.out
+
+
+def test_enhance_masks_as_run_does_or_says_what_it_takes_for_a_pixel(tmp_path):
+    case = demo_case()
+    data = json.loads(case.geometry.read_text())
+    for view in data["views"]:
+        view["intensity"] = {"kind": "attenuation", "polarity": "bright"}
+    imaging = ImagingOptions(segmenter="classic")
+    of_run = prepare(case.pictures, data, RunOptions(imaging=imaging))[0][0]
+    look = ("enhance", case.pictures[0], "--segmenter", "classic", "--kind", "attenuation",
+            "--polarity", "bright")  # fmt: skip
+    told = gcar(*look, "--out", tmp_path / "a", "--pixel-mm", of_run.carm.pixel_at_isocenter_mm)
+    assert told.code == 0 and told.err == ""
+    mask = cv2.imread(str(tmp_path / "a" / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
+    np.testing.assert_array_equal(mask, extract_vessels(of_run, imaging).mask)
+    guessed = gcar(*look, "--out", tmp_path / "b")
+    assert guessed.code == 0 and "150 mm" in guessed.err and "--pixel-mm" in guessed.err
 
 
 def test_doctor_passes_its_self_test():

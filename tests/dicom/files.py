@@ -80,6 +80,23 @@ def group(content: dict) -> Dataset:
     return item
 
 
+def tiny_runs(folder: Path, **changes: object) -> list[Path]:
+    """Two files of the small generated tree: attenuation, vessels bright."""
+    from gcar_deploy.selftest import tiny_case
+
+    files = []
+    for number, angiogram in enumerate(tiny_case()[0], start=1):
+        told = {
+            "PositionerPrimaryAngle": str(angiogram.carm.primary_angle_deg),
+            "PositionerSecondaryAngle": str(angiogram.carm.secondary_angle_deg),
+            "PixelIntensityRelationship": "LOG",
+            "PixelIntensityRelationshipSign": -1,
+        }
+        run = classic(angiogram.pixels.astype(np.uint16)[None], **{**told, **changes})
+        files.append(save(run, folder / f"run{number}.dcm"))
+    return files
+
+
 def save(ds: FileDataset, path: Path) -> Path:
     ds.save_as(path, enforce_file_format=True)
     return path

@@ -10,25 +10,16 @@ pytest.importorskip("pydicom", reason="needs the dicom extra")
 
 from gcar_deploy.selftest import tiny_case
 from tests.cli.conftest import gcar
-from tests.dicom.files import classic, save
+from tests.dicom.files import tiny_runs
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Two DICOM files of the small generated tree, attenuation with bright vessels."""
     folder = tmp_path_factory.mktemp("runs")
+    tiny_runs(folder)
     for number, angiogram in enumerate(tiny_case()[0], start=1):
-        carm = angiogram.carm
-        pixels = angiogram.pixels.astype(np.uint16)[None]
-        ds = classic(
-            pixels,
-            PositionerPrimaryAngle=str(carm.primary_angle_deg),
-            PositionerSecondaryAngle=str(carm.secondary_angle_deg),
-            PixelIntensityRelationship="LOG",
-            PixelIntensityRelationshipSign=-1,
-        )
-        save(ds, folder / f"run{number}.dcm")
-        cv2.imwrite(str(folder / f"view{number}.png"), pixels[0])
+        cv2.imwrite(str(folder / f"view{number}.png"), angiogram.pixels.astype(np.uint16))
     return folder
 
 
@@ -57,7 +48,7 @@ def test_dicom_and_png_by_one_geometry_file(runs, tmp_path):
     [
         (("--frame", "2"), 2, "--frame 2 is outside 1 .. 1 of run1.dcm"),
         (("--frame", "1,1,1"), 2, "3 frames for 2 DICOM files"),
-        (("--frame", "last"), 2, "--frame 'last' must be auto"),
+        (("--frame", "last"), 2, "frame 'last' must be auto"),
         (("--sod", "10"), 2, "--sod"),
     ],
 )
@@ -72,6 +63,16 @@ def test_a_damaged_run_is_3_and_one_line(runs, tmp_path):
     done = gcar("run", tmp_path / "bad.dcm", runs / "run2.dcm", "--out", tmp_path / "r")
     assert done.code == 3 and done.err.count("\n") == 1 and "bad.dcm" in done.err
     assert gcar("geometry", "from-dicom", runs / "run1.dcm").code == 2
+
+
+def test_a_geometry_is_written_to_a_new_file(runs, tmp_path):
+    file = tmp_path / "geom.json"
+    pair = "geometry", "from-dicom", runs / "run1.dcm", runs / "run2.dcm"
+    done = gcar(*pair, "--out", file)
+    assert done.code == 0 and done.out == f"{file}\n" and file.read_text() == gcar(*pair).out
+    assert "new file" in gcar(*pair, "--out", file).err
+    lost = gcar(*pair, "--out", tmp_path / "absent" / "geom.json")
+    assert lost.code == 2 and lost.err.startswith("gcar: error: ") and lost.out == ""
 
 
 def test_enhance(runs, tmp_path):

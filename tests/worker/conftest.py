@@ -126,8 +126,11 @@ def serving(make_queue, good_case, tmp_path):  # noqa: F811 - the imported fixtu
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     yield Client(int(server.effective_port)), folder
-    server.close()
+    # Nothing left to serve, and a pull at its sleeve: else the loop sleeps on for a second.
+    server._map.clear()
+    server.pull_trigger()
     thread.join(10)
+    server.close()
 
 
 @pytest.fixture

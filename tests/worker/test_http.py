@@ -9,6 +9,8 @@ import time
 from importlib import resources
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.worker.conftest import TOKEN, Client, multipart
@@ -141,10 +143,15 @@ def test_only_the_loopback_interface_listens(serving):
         ({"out": "../a"}, "inside"),
         ({"out": "linked/a"}, "link"),
         ({"geometry": 3}, "geometry"),
-        ({"deadline_s": -1}, "above 0"),
+        ({"deadline_s": -1}, "deadline_s = -1"),
         ({"deadline_s": "soon"}, "deadline_s"),
         ({"strict": "yes"}, "strict"),
         ({"forse": True}, "did you mean 'force'"),
+        ({"masks": {"1": "../view1.png"}}, "inside"),
+        ({"masks": {"1": "/etc/passwd"}}, "inside"),
+        ({"masks": {"2": "linked/view2.png"}}, "not allowed"),
+        ({"masks": {"3": "view1.png"}}, "views 1 .. 2"),
+        ({"sod_mm": 76}, "sod_mm = 76.0 must be a number, 300 .. 5,000"),
     ],
 )
 @pytest.mark.req("REQ-41")
@@ -198,6 +205,45 @@ def test_dicom_runs_bring_their_own_geometry(serving):
     assert job["error"] is None or job["error"]["exit_code"] == 6
 
 
+def test_runs_that_want_their_pixel_spacing_get_it(serving):
+    """What the answer advises can be done by the same door."""
+    pytest.importorskip("pydicom")
+    from tests.dicom.files import tiny_runs
+
+    ask, folder = serving
+    files = [("view", path.name, path.read_bytes())
+             for path in tiny_runs(folder, ImagerPixelSpacing=None)]  # fmt: skip
+    body, kind = multipart(files)
+    job = ask("POST", "/v1/reconstruct?wait=60", body, Content_Type=kind).json()
+    assert job["state"] == "failed" and "pixel_spacing_mm" in job["error"]["message"]
+    told = json.dumps({"pixel_spacing_mm": 1.6, "refiner": "none"}).encode()
+    body, kind = multipart([*files, ("options", None, told)])
+    job = ask("POST", "/v1/reconstruct?wait=60", body, Content_Type=kind).json()
+    assert job["state"] == "done", job
+    assert job["result"]["options"]["dicom"]["pixel_spacing_mm"] == 1.6
+    assert job["result"]["refiner"] == "none"
+
+
+@pytest.mark.parametrize("way", ["upload", "folder"])
+def test_a_mask_comes_with_the_order(serving, way):
+    ask, folder = serving
+    mask = cv2.imread(str(folder / "view1.png"), cv2.IMREAD_UNCHANGED)
+    mask = np.where(mask > 0, 255, 0).astype(np.uint8)
+    mask[: len(mask) // 2] = 0
+    cv2.imwrite(str(folder / "m.png"), mask)
+    if way == "folder":
+        job = ask("POST", "/v1/reconstruct?wait=60", {**ORDER, "masks": {"1": "m.png"}}).json()
+    else:
+        parts = [*parts_of(folder), ("mask1", "m.png", (folder / "m.png").read_bytes())]
+        body, kind = multipart(parts)
+        job = ask("POST", "/v1/reconstruct?wait=60", body, Content_Type=kind).json()
+    assert job["state"] in ("done", "refused"), job
+    if job["state"] == "done":
+        assert "view 1: the vessel mask is the user's" in job["result"]["notes"]
+    else:
+        assert job["error"]["exit_code"] == 6
+
+
 def test_bad_bodies(serving):
     ask, folder = serving
     post = lambda body, kind: ask("POST", "/v1/reconstruct", body, Content_Type=kind)  # noqa: E731
@@ -210,6 +256,10 @@ def test_bad_bodies(serving):
         ([*good, ("more", None, b"1")], "unknown part"),
         ([*good[:2], ("geometry", None, b"{")], "not JSON"),
         ([*good, ("options", None, b'{"views": []}')], "parts of their own"),
+        ([*good, ("options", None, b'{"masks": {}}')], "parts of their own"),
+        ([*good, ("options", None, b"[]")], "object"),
+        ([*good, ("mask3", "m.png", b"x")], "views 1 .. 2"),
+        ([*good, ("mask17", "m.png", b"x")], "unknown part"),
     ):
         body, kind = multipart(parts)
         reply = post(body, kind)

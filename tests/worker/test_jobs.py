@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from gcar_deploy.errors import NumericalError
+from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.jobs import JobQueue, QueueFullError
-from gcar_deploy.worker.orders import Order, new_scratch, suffix_of
+from gcar_deploy.worker.orders import Received, new_scratch, suffix_of
 
 
-def an_order(**fields):
-    return Order(views=(Path("a"), Path("b")), geometry={}, **fields)
+def an_order(scratch=None, **fields):
+    return Received(Order(views=(Path("a"), Path("b")), geometry={}, **fields), scratch)
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def test_old_jobs_are_forgotten_with_their_files(queue):
         assert jobs[-1].finished.wait(30)
     # The last to finish may still be counted when its event is seen.
     queue.close()
-    assert not any(job.order.scratch.exists() for job in jobs)
+    assert not any(job.received.scratch.exists() for job in jobs)
     with pytest.raises(QueueFullError):
         queue.submit(an_order())
 

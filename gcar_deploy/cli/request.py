@@ -1,0 +1,144 @@
+"""Options that make an order, each written once; a verb names the fields of the order it takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
+
+import click
+
+from gcar_deploy.inputs.order import (
+    MOST_VIEWS,
+    POSES,
+    PREDICTORS,
+    REFINERS,
+    SEGMENTERS,
+    Order,
+    load_order,
+)
+from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_mask
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_Option: TypeAlias = Callable[[Any], Any]
+_FILE = click.Path(path_type=Path)
+
+
+def _choice(name: str, choices: tuple[str, ...], text: str) -> _Option:
+    # No default value: what is not said leaves an order file, or a running engine, its own.
+    kind = click.Choice(list(choices))
+    return click.option(f"--{name}", type=kind, show_default=choices[0], help=text)
+
+
+#: field of the order -> option; in the order of help
+OPTIONS: Mapping[str, _Option] = {
+    "geometry": click.option(
+        "--geom", "geometry", type=_FILE, help="Geometry of the views (JSON); DICOM has its own."
+    ),
+    "out": click.option("--out", type=_FILE, help="New folder."),
+    "predictor": _choice(
+        "predictor", PREDICTORS, "Who decides depth: a model, or none (the visual hull is thinned)."
+    ),
+    "refiner": _choice("refiner", REFINERS, "How the tree is fitted to the pictures."),
+    "deadline_s": click.option(
+        "--deadline", "deadline_s", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS",
+        help="End the refinement with what it has after so long.",
+    ),
+    "frames": click.option(
+        "--frame", "frames", metavar="N|auto", show_default="auto",
+        help="DICOM: frame of the run, from 1; one for all files, or 7,12 for each.",
+    ),
+    "pixel_spacing_mm": click.option(
+        "--pixel-spacing", "pixel_spacing_mm", type=click.FloatRange(0.02, 10), metavar="MM",
+        help="DICOM without it: pixel spacing at the detector.",
+    ),
+    "sod_mm": click.option(
+        "--sod", "sod_mm", type=click.FloatRange(300, 5000), metavar="MM",
+        help="DICOM without it: source to isocentre.",
+    ),
+    "segmenter": _choice(
+        "segmenter", SEGMENTERS, "Who finds vessels in raw pictures; auto takes the mean of both."
+    ),
+    "pose": _choice("pose", POSES, "Whether shift and turn between the runs are estimated."),
+    "landmarks": click.option(
+        "--landmark", "landmarks", multiple=True, metavar="C1,R1:C2,R2",
+        help="Column and row of one point in each view (- where unseen); repeatable.",
+    ),
+    "masks": click.option(
+        "--mask", "masks", multiple=True, metavar="N:PICTURE",
+        help="Vessel mask of view N, which wins over what is found in the picture; repeatable.",
+    ),
+    "strict": click.option(
+        "--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6)."
+    ),
+    "force": click.option("--force", is_flag=True, help="Replace a folder that gcar wrote."),
+    "glb": click.option("--glb", is_flag=True, help="Write surface.glb as well."),
+    "dicom_stl": click.option(
+        "--dicom-stl", is_flag=True,
+        help="Write surface.dcm (DICOM Encapsulated STL) as well.",
+    ),
+    "file": click.option(
+        "--order", "file", type=_FILE,
+        help="Order file; what else is said on the command line goes before it.",
+    ),
+}  # fmt: skip
+#: what tells how pictures are read
+READING = (
+    "geometry", "frames", "pixel_spacing_mm", "sod_mm", "segmenter", "pose", "landmarks", "masks",
+)  # fmt: skip
+#: what tells how a tree is made of them
+METHOD = ("predictor", "refiner", "deadline_s")
+EXTRA_FILES = ("glb", "dicom_stl")
+#: the old spelling of --mask, still understood
+_SHORT_MASKS = {f"mask{k}": k for k in range(1, MOST_VIEWS + 1)}
+
+
+def order_options(*fields: str) -> Callable[[_Function], Any]:
+    """Add options for these fields of an order; the command gets them as the argument ``order``.
+
+    Parameters
+    ----------
+    fields : keys of ``OPTIONS``; an argument ``views`` of the command goes into the order too
+    """
+
+    def decorate(function: _Function) -> Any:
+        @functools.wraps(function)
+        def wrapper(**values: Any) -> Any:
+            own = {name: values.pop(name) for name in list(values) if name in known}
+            return function(order=made_order(own), **values)
+
+        known = {*fields, "views", *_SHORT_MASKS}
+        command: Any = wrapper
+        for name in _SHORT_MASKS if "masks" in fields else ():
+            command = click.option(f"--{name}", type=_FILE, hidden=True)(command)
+        for name in reversed([name for name in OPTIONS if name in fields]):
+            command = OPTIONS[name](command)
+        return command
+
+    return decorate
+
+
+def made_order(said: Mapping[str, Any]) -> Order:
+    """Make the order of what was said on the command line, over what an order file says.
+
+    Raises
+    ------
+    UsageError
+        A value is not written as it should be, or out of range.
+    """
+    values = {name: value for name, value in said.items() if value not in (None, (), False)}
+    file = values.pop("file", None)
+    masks = dict(parse_mask(text) for text in values.pop("masks", ()))
+    masks |= {k: values.pop(name) for name, k in _SHORT_MASKS.items() if name in values}
+    extras = [name for name in ("glb", "dicom-stl") if values.pop(name.replace("-", "_"), False)]
+    if masks:
+        values["masks"] = masks
+    if extras:
+        values["extras"] = tuple(extras)
+    if "frames" in values:
+        values["frames"] = parse_frames(values["frames"])
+    if "landmarks" in values:
+        values["landmarks"] = tuple(parse_landmark(text) for text in values["landmarks"])
+    return dataclasses.replace(Order() if file is None else load_order(file), **values)

@@ -1,0 +1,295 @@
+"""Order: one reconstruction asked for, the same for command, table of cases and worker.
+
+As JSON it is schema ``gcar-order/1``. Nothing heavy is imported, so that help stays quick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.config import DicomOptions, Landmark, RunOptions
+from gcar_deploy.config.ranges import Range, check_field, check_number
+from gcar_deploy.errors import GeometryError, UsageError
+from gcar_deploy.files import read_text
+from gcar_deploy.geometry.fields import check_choice, check_object, number, quote, read_json, whole
+
+SCHEMA = "gcar-order/1"
+#: pictures of one order
+MOST_VIEWS = 16
+#: bytes of an order as JSON: a geometry may stand in it, and landmarks
+MAX_BYTES = 256 * 1024
+POSES = ("auto", "off")
+SEGMENTERS = ("auto", "classic", "net")
+PREDICTORS = ("auto", "multi", "single", "none")
+REFINERS = ("tube", "paper", "none")
+EXTRAS = ("glb", "dicom-stl")
+_CHOICES = {
+    "pose": POSES, "segmenter": SEGMENTERS, "predictor": PREDICTORS, "refiner": REFINERS,
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Order:
+    """One reconstruction asked for. What is None is as the engine was set up.
+
+    Attributes
+    ----------
+    views : files of pictures or DICOM runs, in the order of the geometry's views
+    geometry : file or content of a ``geom.json``; None where DICOM headers tell it
+    masks : number of the view, from 1 -> file of its vessel mask
+    landmarks : points marked in the pictures, (column, row) in each view or None
+    frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
+    pixel_spacing_mm, sod_mm : for DICOM that does not say it, at the detector
+    pose : ``auto`` or ``off``
+    segmenter, predictor, refiner : who finds vessels, who decides depth, how the tree is fitted
+    deadline_s : seconds that the work may take
+    strict : take a degraded result for a refusal
+    force : replace an earlier result folder
+    out : result folder
+    extras : further files to write, of ``EXTRAS``
+    """
+
+    views: tuple[Path, ...] = ()
+    geometry: Path | Mapping[str, Any] | None = None
+    masks: Mapping[int, Path] = dataclasses.field(default_factory=dict)
+    landmarks: tuple[Landmark, ...] | None = None
+    frames: tuple[int | None, ...] | None = None
+    pixel_spacing_mm: float | None = None
+    sod_mm: float | None = None
+    pose: str | None = None
+    segmenter: str | None = None
+    predictor: str | None = None
+    refiner: str | None = None
+    deadline_s: float | None = None
+    strict: bool = False
+    force: bool = False
+    out: Path | None = None
+    extras: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and those that contradict each other.
+
+        Raises
+        ------
+        UsageError
+            One line that names the key and its value.
+        """
+        for key, choices in _CHOICES.items():
+            if getattr(self, key) is not None:
+                _as_usage(check_choice, key, getattr(self, key), choices)
+        for extra in self.extras:
+            _as_usage(check_choice, "extras", extra, EXTRAS)
+        for key in ("frames", "pixel_spacing_mm", "sod_mm"):
+            if getattr(self, key) is not None:
+                check_field(DicomOptions, key, getattr(self, key))
+        if self.deadline_s is not None:
+            check_number("deadline_s", self.deadline_s, float, Range(1e-9, 1e9))
+        if self.landmarks and self.pose == "off":
+            raise UsageError("a landmark corrects the pose: it cannot be used with pose off")
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Every file it names: ``view1`` ..., ``geometry``, ``mask1`` ... -> path."""
+        found = {f"view{k}": path for k, path in enumerate(self.views, start=1)}
+        if isinstance(self.geometry, Path):
+            found["geometry"] = self.geometry
+        return found | {f"mask{k}": path for k, path in self.masks.items()}
+
+    def with_files(self, change: Callable[[str, Path], Path]) -> Order:
+        """Return the order with each of its files replaced by ``change(name, path)``."""
+        new = {name: change(name, path) for name, path in self.files.items()}
+        return dataclasses.replace(
+            self,
+            views=tuple(new[f"view{k + 1}"] for k in range(len(self.views))),
+            geometry=new.get("geometry", self.geometry),
+            masks={k: new[f"mask{k}"] for k in self.masks},
+        )
+
+    def relative_to(self, folder: Path) -> Order:
+        """Return the order with its relative paths, ``out`` too, taken from ``folder``."""
+        order = self.with_files(lambda _, path: folder / path)
+        return dataclasses.replace(order, out=None if self.out is None else folder / self.out)
+
+    def options(self, base: RunOptions) -> RunOptions:
+        """Return ``base`` with what this order chooses."""
+        dicom = _given(self, "frames", "pixel_spacing_mm", "sod_mm")
+        pose = {} if self.pose is None else {"enabled": self.pose == "auto"}
+        return dataclasses.replace(
+            base,
+            dicom=dataclasses.replace(base.dicom, **dicom),
+            imaging=dataclasses.replace(base.imaging, **_given(self, "segmenter")),
+            pose=dataclasses.replace(base.pose, **pose),
+            predict=dataclasses.replace(base.predict, **_given(self, "predictor")),
+            refine=dataclasses.replace(base.refine, **_given(self, "refiner")),
+            **_given(self, "landmarks"),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the order as JSON values; what is at its default is left out."""
+        out: dict[str, Any] = {"schema": SCHEMA}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value not in (None, False, (), {}):
+                out[field.name] = _plain(value)
+        return out
+
+
+KEYS = ("schema", *(field.name for field in dataclasses.fields(Order)))
+
+
+def parse_order(values: Any) -> Order:
+    """Read an order from JSON values; see ``Order.to_dict``.
+
+    Parameters
+    ----------
+    values : JSON object; ``schema`` may be left out
+
+    Raises
+    ------
+    UsageError
+        A key is missing, unknown or of the wrong kind, or a value is out of range.
+    """
+    try:
+        return _order(values)
+    except GeometryError as error:
+        raise UsageError(str(error)) from None
+
+
+def load_order(path: Path) -> Order:
+    """Read an order file; its relative paths begin at its own folder.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be read, or as ``parse_order``.
+    """
+    try:
+        values = read_json(read_text(path, MAX_BYTES), MAX_BYTES)
+        return parse_order(values).relative_to(path.parent)
+    except (ValueError, GeometryError, UsageError) as error:
+        raise UsageError(f"{path.name}: {error}") from None
+
+
+def order_to_json(order: Order) -> str:
+    """Return the order as the text of a file that reads back as the same order."""
+    return json.dumps(order.to_dict(), indent=1, allow_nan=False) + "\n"
+
+
+def check_views(order: Order) -> None:
+    """Refuse an order that has too few or too many views, or a mask without its view.
+
+    Raises
+    ------
+    UsageError
+    """
+    count = len(order.views)
+    if count < 2:
+        raise UsageError(f"{count} picture given; two or more are needed")
+    if count > MOST_VIEWS:
+        raise UsageError(f"{count} pictures given; at most {MOST_VIEWS} are taken")
+    for k in order.masks:
+        if not 1 <= k <= count:
+            raise UsageError(f"mask {k}: there are views 1 .. {count}")
+
+
+def _order(values: Any) -> Order:
+    check_object("order", values, KEYS)
+    if values.get("schema", SCHEMA) != SCHEMA:
+        raise UsageError(f"schema = {quote(values['schema'])} must be {SCHEMA!r}")
+    given = {k: v for k, v in values.items() if v is not None and k != "schema"}
+    names = _list("views", given.get("views"), "file names")
+    if not 2 <= len(names) <= MOST_VIEWS:
+        raise UsageError(f"views has {len(names)} entries; 2 .. {MOST_VIEWS} are taken")
+    given["views"] = tuple(_path("views", name) for name in names)
+    readers: dict[str, Callable[[str, Any], Any]] = {
+        "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,
+        "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
+        "force": _truth, "out": _path, "extras": _texts,
+    }  # fmt: skip
+    for key, read in readers.items():
+        if key in given:
+            given[key] = read(key, given[key])
+    order = Order(**given)
+    check_views(order)
+    return order
+
+
+def _list(key: str, value: Any, of: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise UsageError(f"{key} = {quote(value)} must be a list of {of}")
+    return value
+
+
+def _path(key: str, value: Any) -> Path:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise UsageError(f"{key} = {quote(value)} must be the name of a file or folder")
+    return Path(value)
+
+
+def _geometry(key: str, value: Any) -> Any:
+    if isinstance(value, dict):
+        return value
+    if not isinstance(value, str):
+        raise UsageError(f"{key} must be the content of a geom.json, or a file name")
+    return _path(key, value)
+
+
+def _masks(key: str, value: Any) -> dict[int, Path]:
+    if not isinstance(value, dict) or not all(k.isdecimal() and len(k) < 3 for k in value):
+        raise UsageError(f"{key} = {quote(value)} must be an object: number of the view -> file")
+    return {int(k): _path(f"{key}.{k}", name) for k, name in value.items()}
+
+
+def _landmarks(key: str, value: Any) -> tuple[Landmark, ...]:
+    return tuple(
+        tuple(None if point is None else _point(key, point) for point in _list(key, one, "points"))
+        for one in _list(key, value, "landmarks")
+    )
+
+
+def _point(key: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise UsageError(f"{key}: {quote(value)} must be [column, row], or null where unseen")
+    return number(key, value[0]), number(key, value[1])
+
+
+def _frames(key: str, value: Any) -> tuple[int | None, ...]:
+    entries = _list(key, value, "frames")
+    return tuple(None if frame is None else whole(key, frame) for frame in entries)
+
+
+def _truth(key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise UsageError(f"{key} = {quote(value)} must be true or false")
+    return value
+
+
+def _texts(key: str, value: Any) -> tuple[Any, ...]:
+    return tuple(_list(key, value, "names"))
+
+
+def _given(order: Order, *keys: str) -> dict[str, Any]:
+    """Those of the order's fields that say something, as keyword arguments."""
+    found = {key: getattr(order, key) for key in keys}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    return value
+
+
+def _as_usage(check: Callable[..., None], *arguments: Any) -> None:
+    try:
+        check(*arguments)
+    except GeometryError as error:
+        raise UsageError(str(error)) from None

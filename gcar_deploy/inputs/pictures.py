@@ -1,0 +1,217 @@
+"""Pair pictures, files or in memory, with the geometry they were taken by."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.dicom.header import is_dicom
+from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
+from gcar_deploy.errors import GeometryError, ImageError, UsageError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
+from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.extract import above_half
+from gcar_deploy.imaging.read import read_picture
+
+#: a file, an array of counts, or a picture that already knows its C-arm
+Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
+#: geom.json as a file, its content, a Scene; or only a Grid where every picture is an Angiogram
+Geometry: TypeAlias = "str | Path | Mapping[str, Any] | Scene | Grid"
+#: a vessel mask: vessel is what exceeds half of its largest value
+Mask: TypeAlias = "str | Path | np.ndarray"
+_DEPTHS = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
+
+
+def prepare(
+    views: Sequence[Picture],
+    geometry: Geometry | None,
+    options: RunOptions,
+    masks: Mapping[int, Mask] | None = None,
+) -> tuple[list[Angiogram], Grid, list[str]]:
+    """Pair pictures with their views.
+
+    Parameters
+    ----------
+    views : 2 or more pictures, in the order of the geometry's views
+    geometry : where they were taken from; None where DICOM headers say it
+    options : RunOptions, of which ``dicom`` and ``imaging.limits`` are used
+    masks : number of the view, from 1 -> vessel mask (picture of its size)
+
+    Returns
+    -------
+    angiograms, grid asked for, sentences worth telling
+
+    Raises
+    ------
+    UsageError
+        Fewer than two pictures, or a mask of no view.
+    GeometryError
+        Not as many pictures as views, or sizes at odds.
+    ImageError
+        A picture or mask cannot be read.
+    """
+    if len(views) < 2:
+        raise UsageError(f"{len(views)} picture given; two or more are needed")
+    if geometry is None:
+        angiograms, grid, notes = _from_headers(views, options)
+    elif isinstance(geometry, Grid):
+        angiograms, grid, notes = _in_memory(views), geometry, []
+    else:
+        angiograms, grid, notes = _by_scene(views, _scene(geometry), options)
+    masks = masks or {}
+    angiograms = with_masks(angiograms, masks, options.imaging.limits)
+    return angiograms, grid, notes + [f"view {k}: the vessel mask is the user's" for k in masks]
+
+
+def with_masks(
+    angiograms: Sequence[Angiogram],
+    masks: Mapping[int, Mask],
+    limits: PictureLimits,
+) -> list[Angiogram]:
+    """Give pictures the user's vessel masks.
+
+    Raises
+    ------
+    UsageError
+        There is no view of that number.
+    ImageError
+        A mask cannot be read, has another size than its picture, or no vessel.
+    """
+    out = list(angiograms)
+    for number, given in masks.items():
+        if not 1 <= number <= len(out):
+            raise UsageError(f"mask {number}: there are views 1 .. {len(out)}")
+        array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
+        shape = out[number - 1].pixels.shape
+        if array.shape != shape:
+            raise ImageError(
+                f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
+            )
+        mask = above_half(array)
+        if not mask.any() or mask.mean() > 0.9:
+            raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
+        out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)
+    return out
+
+
+def _in_memory(views: Sequence[Picture]) -> list[Angiogram]:
+    """Pictures that know their C-arms."""
+    given = [view for view in views if isinstance(view, Angiogram)]
+    if len(given) != len(views):
+        raise UsageError("a Grid alone tells no geometry: give a scene, or Angiograms")
+    return given
+
+
+def _by_scene(
+    views: Sequence[Picture], scene: Scene, options: RunOptions
+) -> tuple[list[Angiogram], Grid, list[str]]:
+    """Pictures of any kind, each with the view of its place."""
+    if len(scene.views) != len(views):
+        raise GeometryError(
+            f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
+        )
+    notes = list(scene.warnings)
+    angiograms = []
+    frames = _frames_for(views, options)
+    for picture, view in zip(views, scene.views, strict=True):
+        if isinstance(picture, Angiogram):
+            angiograms.append(picture)
+        elif isinstance(picture, (str, Path)) and is_dicom(picture):
+            run = read_run(picture, options.dicom, frames.pop(0))
+            carm = _matched(view, run.pixels.shape, notes)
+            angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
+            notes += [f"view {view.id}: {note}" for note in run.notes]
+        else:
+            angiograms.append(_angiogram(picture, view, options.imaging.limits, notes))
+    return angiograms, scene.volume_grid(), notes
+
+
+def _angiogram(
+    picture: str | Path | np.ndarray, view: View, limits: PictureLimits, notes: list[str]
+) -> Angiogram:
+    """Read a picture file, or take an array; what was rescaled is added to ``notes``."""
+    if isinstance(picture, np.ndarray):
+        pixels, depth, sha256 = _from_array(view.id, picture, limits)
+    else:
+        pixels, depth, sha256 = read_picture(picture, limits)
+    return Angiogram(
+        view_id=view.id, carm=_matched(view, pixels.shape, notes), pixels=pixels, bit_depth=depth,
+        intensity=view.intensity, sha256=sha256,
+    )  # fmt: skip
+
+
+def _from_headers(
+    views: Sequence[Picture], options: RunOptions
+) -> tuple[list[Angiogram], Grid, list[str]]:
+    """Pictures whose own headers tell the geometry: DICOM XA alone."""
+    paths = [view for view in views if isinstance(view, (str, Path))]
+    for path in paths:
+        if not is_dicom(path):
+            raise UsageError(
+                f"{Path(path).name} is no DICOM file: its geometry is needed (--geom geom.json)"
+            )
+    if len(paths) != len(views):
+        raise UsageError("pictures in memory tell no geometry: give a scene")
+    angiograms, scene, notes = read_views(paths, options.dicom)
+    return angiograms, scene.volume_grid(), notes
+
+
+def _frames_for(views: Sequence[Picture], options: RunOptions) -> list[int | None]:
+    """Frame of each DICOM file among the pictures, in their order."""
+    runs = sum(isinstance(view, (str, Path)) and is_dicom(view) for view in views)
+    return list(wanted_frames(options.dicom, runs)) if runs else []
+
+
+def _matched(view: View, shape: tuple[int, ...], notes: list[str]) -> CArm:
+    """Fit a view to the size of its picture; what was rescaled is added to ``notes``."""
+    try:
+        carm, note = match_picture(view.carm, shape[0], shape[1])
+    except GeometryError as error:
+        raise GeometryError(f"view {view.id}: {error}") from None
+    if note:
+        notes.append(f"view {view.id}: {note}")
+    return carm
+
+
+def _from_array(
+    view_id: str, array: np.ndarray, limits: PictureLimits
+) -> tuple[np.ndarray, int, str]:
+    """Like ``read_picture`` for counts that are in memory already."""
+    depth = _DEPTHS.get(array.dtype.name)
+    if depth is None or array.ndim != 2:
+        raise ImageError(
+            f"view {view_id}: an array of {array.dtype} with {array.ndim} dimensions; give "
+            "(rows, columns) of uint8, uint16, float32 or float64"
+        )
+    if not limits.min_side <= min(array.shape) <= max(array.shape) <= limits.max_side:
+        raise ImageError(
+            f"view {view_id}: {array.shape[0]} x {array.shape[1]} pixels; each side must be "
+            f"{limits.min_side} .. {limits.max_side}"
+        )
+    if not (np.isfinite(array).all() and array.min() >= 0):
+        raise ImageError(f"view {view_id}: grey values must be finite and not negative")
+    sha256 = hashlib.sha256(f"{array.dtype.name}{array.shape}".encode())
+    sha256.update(np.ascontiguousarray(array).tobytes())
+    return array.astype(np.float32), depth, sha256.hexdigest()
+
+
+def _scene(geometry: Geometry) -> Scene:
+    if isinstance(geometry, Scene):
+        return geometry
+    if isinstance(geometry, Mapping):
+        try:
+            return parse_scene(json.dumps(dict(geometry)), "geometry")
+        except (TypeError, ValueError) as error:
+            raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
+    if isinstance(geometry, (str, Path)):
+        return load_scene(geometry)
+    raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")

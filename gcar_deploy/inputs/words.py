@@ -1,0 +1,64 @@
+"""Parts of an order as people write them, in options and in tables."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+from gcar_deploy.config import Landmark
+from gcar_deploy.errors import UsageError
+
+_MASK = re.compile(r"([1-9]|1[0-6]):(.+)", re.DOTALL)
+
+
+def parse_frames(text: str) -> tuple[int | None, ...]:
+    """Read ``auto``, a number from 1, or one of these for each run, as in ``7,auto``.
+
+    Raises
+    ------
+    UsageError
+    """
+    frames: list[int | None] = []
+    for word in (part.strip() for part in text.split(",")):
+        if word != "auto" and not (word.isascii() and word.isdigit() and len(word) < 7):
+            raise UsageError(f"frame {text[:40]!r} must be auto, a number, or one for each file")
+        frames.append(None if word == "auto" else int(word))
+    return tuple(frames)
+
+
+def parse_landmark(text: str) -> Landmark:
+    """Read ``C1,R1:C2,R2[:C3,R3 ...]``, with - where a view does not show the point.
+
+    Raises
+    ------
+    UsageError
+    """
+    out: list[tuple[float, float] | None] = []
+    for part in text.split(":"):
+        if part.strip() == "-":
+            out.append(None)
+            continue
+        try:
+            column, row = (float(word) for word in part.split(","))
+        except ValueError:
+            column = row = math.nan
+        if not (math.isfinite(column) and math.isfinite(row)):
+            raise UsageError(
+                f"landmark {text[:60]!r} must be column,row:column,row with one point per view"
+            )
+        out.append((column, row))
+    return tuple(out)
+
+
+def parse_mask(text: str) -> tuple[int, Path]:
+    """Read ``N:FILE``, the mask of view N.
+
+    Raises
+    ------
+    UsageError
+    """
+    found = _MASK.fullmatch(text)
+    if found is None:
+        raise UsageError(f"mask {text[:60]!r} must be N:FILE, N the number of the view (1 .. 16)")
+    return int(found[1]), Path(found[2])

@@ -1,0 +1,171 @@
+"""Orders: what JSON says comes back the same, and what is wrong is named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gcar_deploy.config import RunOptions, check_options
+from gcar_deploy.errors import UsageError
+from gcar_deploy.inputs.order import (
+    EXTRAS,
+    KEYS,
+    POSES,
+    PREDICTORS,
+    REFINERS,
+    SCHEMA,
+    SEGMENTERS,
+    Order,
+    load_order,
+    order_to_json,
+    parse_order,
+)
+
+_names = st.text("abcäö 1./-", min_size=1, max_size=12).map(Path)
+_points = st.none() | st.tuples(st.floats(0, 4000), st.floats(0, 4000))
+
+
+@st.composite
+def orders(draw) -> Order:
+    views = tuple(draw(st.lists(_names, min_size=2, max_size=16)))
+    numbers = st.integers(1, len(views))
+    landmark = st.tuples(*[_points] * len(views))
+    pose = draw(st.none() | st.sampled_from(POSES))
+    landmarks = st.lists(landmark, min_size=1, max_size=3).map(tuple)
+    return Order(
+        views=views,
+        geometry=draw(st.none() | _names | st.just({"schema": "gcar-geometry/1", "views": []})),
+        masks=draw(st.dictionaries(numbers, _names, max_size=3)),
+        landmarks=None if pose == "off" else draw(st.none() | landmarks),
+        frames=draw(st.none() | st.lists(st.none() | st.integers(1, 900), min_size=1).map(tuple)),
+        pixel_spacing_mm=draw(st.none() | st.floats(0.02, 10)),
+        sod_mm=draw(st.none() | st.floats(300, 5000)),
+        pose=pose,
+        segmenter=draw(st.none() | st.sampled_from(SEGMENTERS)),
+        predictor=draw(st.none() | st.sampled_from(PREDICTORS)),
+        refiner=draw(st.none() | st.sampled_from(REFINERS)),
+        deadline_s=draw(st.none() | st.floats(0.1, 1e4)),
+        strict=draw(st.booleans()),
+        force=draw(st.booleans()),
+        out=draw(st.none() | _names),
+        extras=tuple(draw(st.lists(st.sampled_from(EXTRAS), unique=True))),
+    )
+
+
+@given(orders())
+def test_json_and_back(order):
+    text = order_to_json(order)
+    assert json.loads(text)["schema"] == SCHEMA
+    assert parse_order(json.loads(text)) == order
+    assert order.with_files(lambda _, path: path) == order
+
+
+@given(orders())
+def test_every_order_makes_options_that_pass_their_checks(order):
+    options = order.options(RunOptions())
+    check_options(options)
+    assert (options.pose.enabled is False) == (order.pose == "off")
+    for key, told in (
+        ("segmenter", options.imaging.segmenter),
+        ("predictor", options.predict.predictor),
+        ("refiner", options.refine.refiner),
+        ("frames", options.dicom.frames),
+        ("sod_mm", options.dicom.sod_mm),
+        ("pixel_spacing_mm", options.dicom.pixel_spacing_mm),
+        ("landmarks", options.landmarks),
+    ):
+        if getattr(order, key) is not None:
+            assert told == getattr(order, key), key
+
+
+def test_what_an_order_leaves_open_is_as_the_engine_was_set_up():
+    base = Order(predictor="none", refiner="paper", pose="off", sod_mm=700).options(RunOptions())
+    assert Order(views=(Path("a"), Path("b"))).options(base) == base
+
+
+BASE = {"views": ["a", "b"]}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"schema": "gcar-order/2"}, "schema = 'gcar-order/2'"),
+        ({"views": ["a"]}, "1 entries"),
+        ({"views": ["a"] * 17}, "17 entries"),
+        ({"views": ["a", 3]}, "views = 3"),
+        ({"views": ["a", ""]}, "views = ''"),
+        ({"geometry": 3}, "geometry must be"),
+        ({"masks": ["m"]}, "number of the view"),
+        ({"masks": {"one": "m"}}, "number of the view"),
+        ({"masks": {"3": "m"}}, "mask 3: there are views 1 .. 2"),
+        ({"masks": {"0": "m"}}, "mask 0"),
+        ({"masks": {"1": 4}}, "masks.1 = 4"),
+        ({"landmarks": [[[1, 2, 3], None]]}, "column, row"),
+        ({"landmarks": [[["1", 2], None]]}, "landmarks = '1'"),
+        ({"landmarks": [[[1, 2], [3, 4]]], "pose": "off"}, "pose off"),
+        ({"frames": [0]}, "frames = 0"),
+        ({"frames": 7}, "list of frames"),
+        ({"frames": [1.5]}, "whole number"),
+        ({"pixel_spacing_mm": 30}, "pixel_spacing_mm = 30.0 must be a number, 0.02 .. 10"),
+        ({"sod_mm": 76.5}, "sod_mm = 76.5 must be a number, 300 .. 5,000"),
+        ({"pose": "of"}, "pose = 'of' must be one of auto, off"),
+        ({"pose": False}, "pose = False"),
+        ({"segmenter": "both"}, "segmenter = 'both'"),
+        ({"predictor": "paper"}, "predictor = 'paper'"),
+        ({"refiner": "auto"}, "refiner = 'auto'"),
+        ({"deadline_s": 0}, "deadline_s = 0"),
+        ({"deadline_s": True}, "deadline_s = True"),
+        ({"strict": 1}, "strict = 1"),
+        ({"out": 1}, "out = 1"),
+        ({"extras": ["stl"]}, "extras = 'stl'"),
+        ({"extras": "glb"}, "list of names"),
+        ({"pixel_spacing": 1}, "did you mean 'pixel_spacing_mm'"),
+    ],
+)
+def test_wrong_orders_name_key_and_value(change, words):
+    with pytest.raises(UsageError) as caught:
+        parse_order({**BASE, **change})
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_relative_paths_of_a_file_begin_at_its_folder(tmp_path):
+    file = tmp_path / "order.json"
+    values = {**BASE, "geometry": "g.json", "masks": {"2": "/m.png"}, "out": "r"}
+    file.write_text(json.dumps(values), encoding="utf-8-sig")
+    order = load_order(file)
+    assert order.files == {
+        "view1": tmp_path / "a", "view2": tmp_path / "b", "geometry": tmp_path / "g.json",
+        "mask2": Path("/m.png"),
+    }  # fmt: skip
+    assert order.out == tmp_path / "r"
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b"\x80", b'{"views": ["a", NaN]}', b""])
+def test_order_files_that_are_none(content, tmp_path):
+    (tmp_path / "o.json").write_bytes(content)
+    with pytest.raises(UsageError, match=r"o\.json: "):
+        load_order(tmp_path / "o.json")
+    with pytest.raises(UsageError, match=r"p\.json: "):
+        load_order(tmp_path / "p.json")
+
+
+def test_the_worker_describes_every_key():
+    """openapi.json is written by hand; what it offers is what an order takes."""
+    from importlib import resources
+
+    text = resources.files("gcar_deploy.worker").joinpath("openapi.json").read_text("utf-8")
+    schemas = json.loads(text)["components"]["schemas"]
+    said = schemas["Order"]["allOf"]
+    known = set(said[1]["properties"]) | set(schemas["Options"]["properties"])
+    assert known == set(KEYS)
+    options = schemas["Options"]["properties"]
+    for key, choices in (
+        ("pose", POSES), ("segmenter", SEGMENTERS), ("predictor", PREDICTORS),
+        ("refiner", REFINERS),
+    ):  # fmt: skip
+        assert options[key]["enum"] == [*choices, None]
+    assert options["extras"]["items"]["enum"] == list(EXTRAS)
