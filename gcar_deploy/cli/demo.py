@@ -42,13 +42,13 @@ def demo(order: Order, engine: EngineChoice, talk: Talk) -> None:
     from gcar_deploy.measure.metrics import volume_measures
 
     case = demo_case()
-    out = order.out or _FOLDER
+    target = order.out or _FOLDER
     order = dataclasses.replace(
         order,
         views=tuple(case.pictures),
         geometry=case.geometry,
-        out=out,
-        force=order.force or _holds_a_demo(out, case.pictures),
+        out=target,
+        force=order.force or _holds_a_demo(target, case.pictures),
     )
     check_target_of(order)
     with talk.bar() as bar:

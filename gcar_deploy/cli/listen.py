@@ -80,8 +80,7 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
       gcar listen --out results
       storescu -xs -aec GCAR 127.0.0.1 11112 run1.dcm run2.dcm
 
-    That storescu is DCMTK's (pynetdicom brings another of the same name, which wants -cx for -xs);
-    -xs offers JPEG lossless, as archives store runs, beside the uncompressed syntaxes.
+    That storescu is DCMTK's; pynetdicom brings another of the same name, which wants -cx for -xs.
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
 

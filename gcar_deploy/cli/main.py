@@ -54,7 +54,8 @@ class LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the verb; a misspelt one is told which it may have been."""
         name = args[0] if args else ""
-        if name and not name.startswith("-") and name not in VERBS:
+        known = name in VERBS or name.startswith("-") or ctx.resilient_parsing
+        if name and not known:
             close = difflib.get_close_matches(name[:80], VERBS, n=1, cutoff=0.5)
             hint = f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(VERBS)}"
             ctx.fail(f"no verb {name[:80]!r}{hint}")

@@ -6,7 +6,6 @@ import csv
 import html.parser
 import json
 import os
-import signal
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,7 @@ from gcar_deploy.batch.summary import summary_csv, summary_html
 from gcar_deploy.batch.work import BatchEngine
 from gcar_deploy.errors import UsageError
 from gcar_deploy.inputs.order import Order
+from tests.batch.dying import suicidal
 from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
 
 ENGINE = BatchEngine(threads=1)
@@ -113,16 +113,6 @@ def test_a_changed_case_is_not_passed_off_as_the_old_one(table, tmp_path, monkey
     (tmp_path / "bad.json").write_text("{}")
     with pytest.raises(UsageError, match="bad-geometry"):
         run_batch(cases, tmp_path / "out", ENGINE)
-
-
-def suicidal(job):
-    """Stands for a case that crashes a library: the process is gone without a word."""
-    marker = job.marker
-    open(marker, "w").close()
-    if job.case == "killer":
-        os.kill(os.getpid(), signal.SIGKILL)
-    os.unlink(marker)
-    return {**work.error_row(job.case, "ok", "", 0), "fingerprint": job.fingerprint}
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from tests.cli.conftest import gcar
 def run(folder, out, *arguments):
     return gcar(
         "run", folder / "view1.png", folder / "view2.png", "--geom", folder / "geom.json",
-        "--out", out, *arguments,
+        "--out", out, "--predictor", "none", "--refiner", "none", *arguments,
     )  # fmt: skip
 
 

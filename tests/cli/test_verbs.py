@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -77,6 +78,18 @@ def test_a_misspelt_verb_is_told_which_it_may_be(wrong, meant):
     assert done.code == 2 and done.out == "" and len(done.err.splitlines()) == 1
     said = f"no verb {wrong!r}; did you mean {meant!r}?" if meant else "; known: run, validate"
     assert said in done.err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="shells")
+def test_the_shell_completes_verbs_and_options():
+    """What the tour tells to put into the shell's start-up file asks the command like this."""
+    for words, wanted in (("gcar va", "validate"), ("gcar run --pixel", "--pixel-spacing")):
+        done = subprocess.run(
+            [sys.executable, "-m", "gcar_deploy.cli.main"], capture_output=True, text=True,
+            env={**os.environ, "_GCAR_COMPLETE": "bash_complete", "COMP_WORDS": words,
+                 "COMP_CWORD": str(words.count(" "))},
+        )  # fmt: skip
+        assert f"plain,{wanted}" in done.stdout.splitlines(), done.stderr
 
 
 @pytest.mark.benchmark

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ import pydicom
 from pydicom.uid import ExplicitVRLittleEndian, SecondaryCaptureImageStorage, generate_uid
 from pynetdicom import AE
 
+from gcar_deploy.cli.listen import listen
 from gcar_deploy.dicom.header import CLASSIC
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
@@ -26,7 +28,7 @@ from gcar_deploy.selftest import tiny_tree
 from gcar_deploy.tubes.model import footprint, tubes_of
 from gcar_deploy.worker.jobs import JobQueue
 from gcar_deploy.worker.listen import Listener, tell
-from tests.dicom.files import classic, save
+from tests.dicom.files import classic, jpeg_lossless, save
 from tests.worker.conftest import dcmtk
 
 VERIFICATION = "1.2.840.10008.1.1"
@@ -141,37 +143,32 @@ def test_wrong_calls(tmp_path, listening):
         Listener(queue, tmp_path, title="GCAR").start(port)
 
 
-SENDERS = {
-    "pynetdicom": [sys.executable, "-m", "pynetdicom", "storescu"],
-    "dcmtk": [dcmtk("storescu")],
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("sender", SENDERS)
-def test_from_storescu_to_report(runs, tmp_path, sender):
-    study, files = runs
-    command = SENDERS[sender]
-    if command[0] is None:
+def test_the_documented_storescu_sends_what_archives_keep(runs, tmp_path):
+    """The line of the guide, with DCMTK's tool and runs in JPEG lossless."""
+    pytest.importorskip("gdcm", reason="encodes JPEG lossless")
+    tool = dcmtk("storescu")
+    if tool is None:
         pytest.skip("no storescu of DCMTK")
+    study, files = runs
+    for number, file in enumerate(files, start=1):
+        jpeg_lossless(file, tmp_path / f"run{number}.dcm")
     listener = subprocess.Popen(
-        [sys.executable, "-m", "gcar_deploy.cli.main", "listen", "--out", tmp_path, "--port", "0",
-         "--predictor", "none", "--once"],
+        [sys.executable, "-m", "gcar_deploy.cli.main", "listen", "--out", tmp_path / "out",
+         "--port", "0", "--predictor", "none", "--once"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert listener.stderr
     port = re.fullmatch(r"gcar: GCAR on 127\.0\.0\.1:(\d+)\n", listener.stderr.readline())
     assert port
-    called = ["-aec", "GCAR", "127.0.0.1", port[1]]
-    # DCMTK names the contexts that it offers, pynetdicom reads them from the files.
-    extra = ["-cx"] if sender == "pynetdicom" else ["-R"]
-    sent = subprocess.run(
-        [*command, *extra, *called, *map(str, files)], capture_output=True, text=True, timeout=120
-    )
+    guide = (Path(__file__).parents[2] / "docs" / "host-guide.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"storescu -xs .*\.dcm", guide)
+    assert line in (listen.help or "")
+    command = [tool, *line.replace("11112", port[1]).split()[1:]]
+    sent = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert sent.returncode == 0, sent.stderr
     out, err = listener.communicate(timeout=300)
     assert listener.returncode == 0, err
     told = json.loads(out)
     assert told["study"] == study and told["state"] == "done", told
-    assert (tmp_path / study / "report.html").is_file()
-    assert [p.name for p in tmp_path.iterdir()] == [study]
+    assert (tmp_path / "out" / study / "report.html").is_file()

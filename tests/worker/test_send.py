@@ -204,7 +204,10 @@ def test_from_storescu_to_storescp(runs, tmp_path, maker):  # noqa: F811
         other.terminate()
         other.wait(60)
     told = json.loads(out)
+    assert listener.returncode == 0, err
+    assert told["study"] == study and told["state"] == "done", told
     assert (told["sent"], told["send_error"]) == (3, None), err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [study]
     assert (tmp_path / "out" / study / "report.html").is_file()
     stored = [pydicom.dcmread(path) for path in (tmp_path / "archive").iterdir()]
     assert sorted(data.SOPClassUID for data in stored) == sorted([BOTH[1], BOTH[1], BOTH[0]])

@@ -125,32 +125,13 @@ def test_paths_are_held_to_the_folder_where_one_is_given(make_queue, case_folder
 
 
 @pytest.mark.slow
-def test_as_a_process_of_its_own(case_folder, tmp_path):
-    """Nothing but messages on stdout; the end of the input ends it."""
-    lines = [
-        {"jsonrpc": "2.0", "id": 1, "method": "reconstruct",
-         "params": order(case_folder, tmp_path / "out")},
-    ]  # fmt: skip
-    worker = subprocess.Popen(
-        [sys.executable, "-m", "gcar_deploy.cli.main", "serve", "--stdio", "--predictor", "none"],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert worker.stdin and worker.stdout
-    for line in lines:
-        worker.stdin.write(json.dumps(line) + "\n")
-    worker.stdin.flush()
-    while "id" not in (message := json.loads(worker.stdout.readline())):
-        assert message["method"] == "progress"
-    assert message["result"]["out"] == str(tmp_path / "out")
-    out, err = worker.communicate(timeout=120)
-    assert out == "" and err == "" and worker.returncode == 0
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="POSIX limits")
 @pytest.mark.req("REQ-41")
 def test_a_job_that_needs_too_much_memory_fails_alone(good_case, tmp_path):
-    """2^28 voxels are allowed and want several GiB; the worker may have two."""
+    """2^28 voxels are allowed and want several GiB; the worker, a process, may have two.
+
+    Nothing but messages is on its stdout, and the end of its input ends it.
+    """
     geometry = json.loads((good_case / "geom.json").read_text())
     huge = json.loads(json.dumps(geometry))
     huge["volume"]["shape"] = [640, 640, 640]
@@ -181,8 +162,8 @@ def test_a_job_that_needs_too_much_memory_fails_alone(good_case, tmp_path):
                 answers[message["id"]] = message
             if len(answers) == 2:
                 break
-        worker.stdin.close()
-        assert worker.wait(timeout=120) == 0
+        out, err = worker.communicate(timeout=120)
+        assert worker.returncode == 0 and out == b"" and err == b""
     assert refused == 2
     assert "out of memory" in answers[0]["error"]["message"] and answers[0]["error"]["code"] == 1
     assert answers[1]["result"]["result"]["status"] in ("ok", "degraded")
