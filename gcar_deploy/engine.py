@@ -24,6 +24,8 @@ from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.result import Result
 from gcar_deploy.stopwatch import OnProgress
 
+_NO_FOLDER = "out is missing: name the folder for the result (--out DIR)"
+
 
 class Engine:
     """Holds the model and the options; one instance may serve many threads.
@@ -214,7 +216,7 @@ def check_target_of(order: Order) -> Path:
         file needs a library that is not installed.
     """
     if order.out is None:
-        raise UsageError("out is missing: name the folder for the result")
+        raise UsageError(_NO_FOLDER)
     check_target(order.out, force=order.force, inputs=tuple(order.files.values()))
     check_extras(order.extras)
     return order.out
@@ -231,7 +233,7 @@ def deliver(result: Result, order: Order) -> Path:
         As ``Result.save``.
     """
     if order.out is None:
-        raise UsageError("out is missing: name the folder for the result")
+        raise UsageError(_NO_FOLDER)
     if order.strict and result.status != "ok":
         raise RefusedError(f"degraded, and strict was asked for: {result.quality.sentence}")
     return result.save(order.out, force=order.force, extras=order.extras)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "commands.md"
 _HEAD = """# Commands
 
 Made from the commands by `python -m gcar_export.shipping.command_reference`; do not edit.
@@ -72,7 +72,8 @@ def _row(parameter: click.Parameter) -> str:
     kind = _kind(option)
     text = (getattr(option, "help", None) or "").replace("|", "\\|")
     required = "required" if option.required else ""
-    default = option.default
+    told = getattr(option, "show_default", None)
+    default = told if isinstance(told, str) else option.default
     shown = (
         f"`{default}`"
         if isinstance(default, (str, int, float))

@@ -143,7 +143,9 @@ def talk_options(*wanted: str) -> Callable[[_Function], Any]:
 
 def engine_options(function: _Function) -> Any:
     """Add --model and --threads; they come as the argument ``engine``."""
-    model = click.option("--model", type=click.Path(), help="ONNX file; spec beside it.")
+    model = click.option(
+        "--model", type=click.Path(), help="Predictor as an ONNX file; spec beside it."
+    )
     threads = click.option("--threads", type=click.IntRange(1, 256), help="At most so many.")
     return gathered("engine", EngineChoice, {"threads": threads, "model": model})(function)
 

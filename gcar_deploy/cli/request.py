@@ -37,7 +37,7 @@ OPTIONS: Mapping[str, _Option] = {
     "geometry": click.option(
         "--geom", "geometry", type=_FILE, help="Geometry of the views (JSON); DICOM has its own."
     ),
-    "out": click.option("--out", type=_FILE, help="New folder."),
+    "out": click.option("--out", type=_FILE, help="New folder for what is written."),
     "predictor": _choice(
         "predictor", PREDICTORS, "Who decides depth: a model, or none (the visual hull is thinned)."
     ),

@@ -15,7 +15,7 @@ from gcar_deploy.inputs.order import Order
 
 @click.command(short_help="Check pictures and geometry without reconstructing.")
 @click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 ...")
-@order_options(*READING, "file")
+@order_options(*READING, "predictor", "file")
 @talk_options("as_json")
 def validate(order: Order, talk: Talk) -> None:
     """Check pictures and their geometry without reconstructing.
