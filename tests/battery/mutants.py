@@ -261,13 +261,6 @@ MUTANTS = (
         ("tests/imaging/test_extract.py",),
     ),
     Mutant(
-        "models: a missing segmenter is not told",
-        "gcar_deploy/imaging/extract.py",
-        'return segmenter, [] if segmenter or options.segmenter == "net" else [MISSING]',
-        "return segmenter, []",
-        ("tests/models/test_session.py::test_a_missing_network_is_never_silent",),
-    ),
-    Mutant(
         "tree: branches run from their free end",
         "gcar_deploy/tree/rooted.py",
         "if far[b.start] > far[b.end]",

@@ -101,13 +101,6 @@ def test_20_cloning_without_bounds_meets_the_cap(views, changes):
 
 
 @pytest.mark.slow
-def test_20_thousands_of_duplicates(views):
-    one = start().select(np.zeros(3000, np.int64))
-    out = refine_paper(one, views, dataclasses.replace(OPTIONS, steps=4, most_gaussians=3000))
-    assert np.isfinite(out.gaussians.means_mm).all() and len(out.gaussians) <= 3000
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "place",
     ["behind the source", "at the source", "behind the detector", "beside the source"],
