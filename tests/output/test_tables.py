@@ -76,6 +76,22 @@ def test_csv_numbers_arcs_and_unknown_sigma(result):
     assert float(last["arc_mm"]) == pytest.approx(hidden.length_mm, abs=1e-4)
 
 
+def test_table_and_json_state_the_trees_own_numbers(result):
+    rows = list(csv.DictReader(io.StringIO(centerline_csv(result.tree).decode("ascii"))))
+    own = {
+        "radius_mm": result.tree.radii(),
+        "sigma_mm": np.concatenate([b.sigma_mm for b in result.tree.branches]),
+        "confidence": np.concatenate([b.confidence for b in result.tree.branches]),
+        **dict(zip(("x_mm", "y_mm", "z_mm"), result.tree.points().T, strict=True)),
+    }
+    for name, values in own.items():
+        np.testing.assert_allclose([float(row[name]) for row in rows], values, rtol=1e-4, atol=1e-5)
+    for branch, told in zip(
+        result.tree.branches, result.summary()["tree"]["branches"], strict=True
+    ):
+        assert told["mean_sigma_mm"] == pytest.approx(branch.sigma_mm.mean())
+
+
 def long_tree(branches=40, points=400):
     t = np.linspace(0, 100, points)
     line = np.stack([t, np.sin(t / 9), t * 0], axis=1)
