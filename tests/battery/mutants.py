@@ -244,7 +244,7 @@ MUTANTS = (
         "gcar_deploy/pose/agreement.py",
         "    return check_order(ids, given, other, calibrated, options.quality)",
         '    return [], ""',
-        ("tests/hard/test_matrix.py::test_hard_case[16 flips: views swapped]",),
+        ("tests/hard/test_matrix.py::test_swapped_pictures_are_asked_for_by_name",),
     ),
     Mutant(
         "views: validate does not judge the poses",

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from gcar_deploy.engine import Engine
-from tests.hard.cases import FAMILIES
+from tests.hard.cases import FAMILIES, TREE
 from tests.hard.phantoms import (
     DONE,
     GRID,
     NOT_OK,
+    PAIR,
     distances,
     engine_without_model,
     everything_finite,
     outcome,
+    paths,
+    told,
 )
 
 ARGUMENTS = ("make", "allowed", "truth", "grid")
@@ -95,6 +98,12 @@ def test_hard_case_of_each_family(shipped, make, allowed, truth, grid):
 @pytest.mark.parametrize(ARGUMENTS, [case for case in CASES if case not in QUICK])
 def test_hard_case(shipped, make, allowed, truth, grid):
     check(outcome(make, shipped, grid), allowed, truth)
+
+
+def test_swapped_pictures_are_asked_for_by_name(bare):
+    """Seven branches the wrong way round; other doubts would make the case degraded as well."""
+    found = outcome(lambda: told(paths(TREE), PAIR[::-1]), bare)
+    assert any("are the pictures swapped?" in text for text in found.result.quality.findings)
 
 
 @pytest.mark.slow
