@@ -12,11 +12,9 @@ from gcar_deploy.errors import UsageError
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _OUT = click.Path(path_type=Path)
+_SET_UPS = ["paper", "clinical", "moved", "raw"]
 _PROTOCOL = click.option(
-    "--protocol",
-    type=click.Choice(["paper", "clinical", "moved", "raw"]),
-    default="paper",
-    show_default=True,
+    "--protocol", type=click.Choice(_SET_UPS), default="paper", show_default=True
 )
 _PAPER_STEPS = click.option(
     "--paper-steps", type=int, help="Steps of the paper's refinement in all rows that use it."
@@ -51,7 +49,13 @@ class _Progress:
 
 @click.command()
 @click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
-@_PROTOCOL
+@click.option(
+    "--protocol",
+    type=click.Choice([*_SET_UPS, "common"]),
+    default="paper",
+    show_default=True,
+    help="common: masks of one artery, as PPCAR-Net and its peers are compared.",
+)
 @click.option(
     "--methods",
     default="ours,multi,hull+tube,hull,visual_hull,fdk,sart,nerp",
@@ -105,6 +109,7 @@ def evaluate(
     --views 2,4 --out results
     """
     from gcar_export.evaluate import evaluate as evaluation
+    from gcar_export.evaluate import peers
     from gcar_export.evaluate import tables as evaluation_tables
     from gcar_export.evaluate.report import draw
     from gcar_export.methods.settings import DESCRIPTIONS, MethodSettings
@@ -141,6 +146,7 @@ def evaluate(
         finally:
             progress.close()
     click.echo(evaluation_tables.markdown(rows, reference))
+    click.echo(peers.beside_peers(rows))
     click.echo(draw(rows, out, reference))
 
 

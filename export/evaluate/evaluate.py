@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import UsageError
-from gcar_export.evaluate import paper_tables, tables
+from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
 from gcar_export.evaluate.jobs import Job, case_name, row_path, write_done
-from gcar_export.evaluate.protocols import PROTOCOLS
+from gcar_export.evaluate.protocols import GROUPS, PROTOCOLS
 from gcar_export.methods.settings import METHODS, MethodSettings
 from gcar_export.methods.solve import check_models
 
@@ -44,7 +44,7 @@ class EvaluateOptions:
     data : folder with label volumes (``imagecas/``, ``asoca/``, or the files themselves; a
         folder that holds them in ``data/`` is taken as well)
     out : folder for rows, tables and pictures; may hold an interrupted evaluation
-    protocol : one of ``PROTOCOLS``
+    protocol : one of ``PROTOCOLS`` or ``GROUPS``
     methods : names from ``METHODS``
     views : numbers of views
     jobs : processes
@@ -72,8 +72,9 @@ class EvaluateOptions:
     settings: MethodSettings = dataclasses.field(default_factory=MethodSettings)
 
     def __post_init__(self) -> None:
-        if self.protocol not in PROTOCOLS:
-            raise UsageError(f"protocol {self.protocol!r} is none of {', '.join(PROTOCOLS)}")
+        if self.protocol not in (*PROTOCOLS, *GROUPS):
+            known = ", ".join((*PROTOCOLS, *GROUPS))
+            raise UsageError(f"protocol {self.protocol!r} is none of {known}")
         unknown = [m for m in self.methods if m not in METHODS]
         if unknown or not self.methods:
             raise UsageError(f"unknown method {unknown}; there are {', '.join(METHODS)}")
@@ -89,6 +90,11 @@ class EvaluateOptions:
             raise UsageError(f"changed = {self.changed!r} is none of {', '.join(CHANGED)}")
         if set(self.redo) - set(self.methods):
             raise UsageError(f"redo = {', '.join(self.redo)}: not all are among the methods")
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """The protocols that ``protocol`` asks for."""
+        return GROUPS.get(self.protocol, (self.protocol,))
 
 
 def find_labels(data: Path) -> list[Path]:
@@ -133,9 +139,9 @@ def evaluate(
     digests = {method: options.settings.digest(method) for method in options.methods}
     jobs = [
         Job(
-            label=label, protocol=options.protocol, method=method, views=views,
-            digest=digests[method],
+            label=label, protocol=protocol, method=method, views=views, digest=digests[method]
         )
+        for protocol in options.protocols
         for label in labels
         for views in options.views
         for method in options.methods
@@ -172,7 +178,7 @@ def write_summaries(rows: Sequence[dict[str, Any]], out: Path, reference: str) -
     tests = json.dumps(tables.paired_tests(rows, reference), indent=1, allow_nan=False)
     (out / "wilcoxon.json").write_text(tests)
     text = [tables.markdown(rows, reference), tables.over_views(rows)]
-    text.append(paper_tables.layout(rows, reference))
+    text += [paper_tables.layout(rows, reference), peers.beside_peers(rows)]
     short = tables.not_first(rows, reference) + tables.worse_with_views(rows, reference)
     text.append(f"Where {reference} is not first with p < 0.05:\n")
     text += [f"- {sentence}" for sentence in short] or ["- nowhere"]

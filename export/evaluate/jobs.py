@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from gcar_deploy.measure.metrics import (
     Measure,
@@ -23,7 +24,7 @@ from gcar_deploy.measure.metrics import (
     volume_measures,
 )
 from gcar_deploy.types import Array, Volume
-from gcar_export.evaluate.protocols import Case, make_case
+from gcar_export.evaluate.protocols import COMMON, Case, make_case
 from gcar_export.methods.settings import MethodSettings
 from gcar_export.methods.solve import Solved, solve
 from gcar_export.scenes.labels import LabelVolume, read_label
@@ -121,11 +122,19 @@ def measure(case: Case, solved: Solved) -> dict[str, Measure]:
 
     New projections are cast from the returned volume, clipped to 0 .. 1, and averaged over
     the case's new views (those on which the measure is defined). Where the patient moved between
-    the views, DSC is also given for the best common shift, which no two views can see.
+    the views, DSC is also given for the best common shift, which no two views can see. The common
+    protocol sums both directions of the Chamfer distance and counts connected components.
     """
-    found = volume_measures(case.truth, solved.volume, case.grid.spacing_mm)
+    common = case.protocol in COMMON
+    found = volume_measures(case.truth, solved.volume, case.grid.spacing_mm, structure=not common)
     if case.protocol == "moved":
         found["shifted_dsc"] = best_shifted_dice(case.truth, solved.volume)
+    if common:
+        both = found["chamfer_mm"]
+        found["cd_mm"] = Measure(None if both.value is None else 2 * both.value, both.reason)
+        found["parts"] = connected_parts(solved.volume)
+    if not case.new_views:
+        return found
     per_view = []
     for carm, truth_mm in zip(case.new_views, case.new_projections(), strict=True):
         predicted = None
@@ -136,6 +145,14 @@ def measure(case: Case, solved: Solved) -> dict[str, Measure]:
     for name in per_view[0]:
         found[f"new_{name}"] = _mean([view[name] for view in per_view])
     return found
+
+
+def connected_parts(volume: Volume | None) -> Measure:
+    """Count connected components (26 neighbours) at 0.5; undefined where there is nothing."""
+    if volume is None:
+        return Measure(None, "no prediction")
+    count = int(ndimage.label(volume >= 0.5, np.ones((3, 3, 3)))[1])
+    return Measure(float(count)) if count else Measure(None, "prediction is empty")
 
 
 def three_sides(volume: Volume) -> Array:

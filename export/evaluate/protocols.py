@@ -1,4 +1,4 @@
-"""The four simulated set-ups: paper, clinical, moved, raw. A label becomes a ``Case``.
+"""The simulated set-ups: a label becomes a ``Case``.
 
 ========== ==================================================================================
 protocol   what
@@ -10,6 +10,10 @@ clinical   left tree alone, RAO30 CAU20 and LAO45 CRA25, SOD 765, SDD 1100 and 1
 moved      as clinical, but the patient moved by (1.5, -2, 3) mm before view 2 and its primary
            angle is 1 deg off; the scene says nothing of it
 raw        as clinical, but 8-bit raw pictures with noise, spine, ribs and diaphragm
+common-lca left artery alone, its centroid in the isocentre, binary masks of 256x256 pixels of
+           0.65 mm, RAO25 CAU35 and LAO40 CRA20, SOD 750, SDD 900, voxels of 0.5 mm (PPCAR-Net,
+           arXiv 2610.09383; ``common`` is this and the next)
+common-rca right artery alone, the same with 0.55 mm, RAO20 CRA20 and LAO60
 ========== ==================================================================================
 """
 
@@ -18,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +37,16 @@ from gcar_export.scenes.labels import LabelVolume
 from gcar_export.scenes.raw_pictures import raw_picture
 from gcar_export.scenes.raycast import raycast
 
-PROTOCOLS = ("paper", "clinical", "moved", "raw")
+#: set-ups with masks of one artery -> side of the label, pitch in mm, (primary, secondary)
+COMMON: Mapping[str, tuple[int, float, tuple[tuple[float, float], ...]]] = {
+    "common-lca": (0, 0.65, ((-25, -35), (40, 20))),
+    "common-rca": (1, 0.55, ((-20, 20), (60, 0))),
+}
+PROTOCOLS = ("paper", "clinical", "moved", "raw", *COMMON)
+#: what one word asks for
+GROUPS: Mapping[str, tuple[str, ...]] = {"common": tuple(COMMON)}
+#: a ray through half a voxel of the labels (0.5 mm) or more is vessel in a mask, mm
+MASK_PATH_MM = 0.25
 #: mm of vessel per count of a simulated 16-bit picture.
 MM_PER_COUNT = 0.001
 PAPER_VOXEL_MM = 180.0 / 128
@@ -111,7 +125,8 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
     Parameters
     ----------
     label : LabelVolume
-        The whole label volume; the clinical protocols take the left tree out of it.
+        The whole label volume; the clinical protocols take the left tree out of it, the common
+        ones the left or the right.
     protocol : str
         One of ``PROTOCOLS``.
     views : int
@@ -127,8 +142,13 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
         raise UsageError(f"protocol {protocol!r} is none of {', '.join(PROTOCOLS)}")
     if not 2 <= views <= len(CLINICAL_VIEWS):
         raise UsageError(f"views = {views} is outside 2 .. {len(CLINICAL_VIEWS)}")
+    if protocol in COMMON and views != len(COMMON[protocol][2]):
+        raise UsageError(f"views = {views}: protocol {protocol} has two views")
     if protocol == "paper":
         tree, carms, new, grid = label.roughly_centred(), *_paper_geometry(views)
+    elif protocol in COMMON:
+        tree = _at_centroid(label.left_right()[COMMON[protocol][0]])
+        carms, new, grid = _common_geometry(protocol)
     else:
         tree = label.left_right()[0].centred()
         carms, new, grid = clinical_geometry(views)
@@ -138,6 +158,9 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
         rng = np.random.default_rng(zlib.crc32(label.name.encode()))
         pictures = tuple(raw_picture(path, rng) for path in paths)
         intensity = Intensity(kind="raw", polarity="dark", mm_per_count=None)
+    elif protocol in COMMON:
+        pictures = tuple(np.uint8(255) * (path >= MASK_PATH_MM) for path in paths)
+        intensity = Intensity(kind="mask", polarity="bright", mm_per_count=None)
     else:
         pictures = tuple(_counts(path) for path in paths)
         intensity = Intensity(kind="path_length", polarity="bright", mm_per_count=MM_PER_COUNT)
@@ -227,6 +250,30 @@ def clinical_geometry(views: int) -> tuple[list[CArm], list[CArm], Grid]:
         [carm(*view) for view in CLINICAL_NEW_VIEWS],
         grid,
     )
+
+
+def _common_geometry(protocol: str) -> tuple[list[CArm], list[CArm], Grid]:
+    """Return views, no new views, and the grid that measures are taken on."""
+    _, pitch, directions = COMMON[protocol]
+    carms = [
+        CArm(
+            primary_angle_deg=primary,
+            secondary_angle_deg=secondary,
+            sod_mm=750,
+            sdd_mm=900,
+            rows=256,
+            columns=256,
+            pixel_spacing_mm=(pitch, pitch),
+        )
+        for primary, secondary in directions
+    ]
+    return carms, [], Grid(center_mm=(0, 0, 0), size_mm=(128,) * 3, shape=(256,) * 3)
+
+
+def _at_centroid(tree: LabelVolume) -> LabelVolume:
+    """Return the tree moved so that its centroid is the isocentre."""
+    filled = np.argwhere(tree.occupancy >= 0.5)
+    return tree.moved(-tree.grid.index2world(filled.mean(axis=0)))
 
 
 def _as_told(tree: LabelVolume, carm: CArm, index: int) -> Array:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gcar_deploy.types import Array
-from gcar_export.evaluate import paper_tables, tables
+from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.jobs import TRUTH, sides_path
 from gcar_export.evaluate.plots import all_figures, figure
 
@@ -161,6 +161,7 @@ def _page(
     parts.append(_html(tables.markdown(rows, reference)))
     parts.append(_html(tables.over_views(rows)))
     parts.append(_html(paper_tables.layout(rows, reference)))
+    parts.append(_html(peers.beside_peers(rows)))
     short = tables.not_first(rows, reference) + tables.worse_with_views(rows, reference)
     parts.append(f"<h2>Where {html.escape(reference)} is not first with p &lt; 0.05</h2><ul>")
     parts += [f"<li>{html.escape(sentence)}</li>" for sentence in short] or ["<li>nowhere</li>"]

@@ -32,6 +32,8 @@ MEASURES: Mapping[str, Column] = {
     "ot_2mm": Column("Ot(2 mm) %"),
     "chamfer_mm": Column("Chamfer mm", factor=1.0, better=-1),
     "cldice": Column("clDice %"),
+    "cd_mm": Column("CD (sum) mm", factor=1.0, better=-1),
+    "parts": Column("components", factor=1.0, better=-1),
     "new_dsc": Column("new-proj. DSC %"),
     "new_psnr_db": Column("new-proj. PSNR dB", factor=1.0),
     "new_psnr_masked_db": Column("masked PSNR dB", factor=1.0),
@@ -42,6 +44,8 @@ COUNTS: Mapping[str, Column] = {
     "seconds": Column("s", factor=1.0, better=-1),
     "cpu_seconds": Column("CPU s", factor=1.0, better=-1),
 }
+#: measures that some protocols have, shown where one does
+SOME = ("shifted_dsc", "cd_mm", "parts", "new_dsc", "new_psnr_db", "new_psnr_masked_db", "ssim")
 _NAMES = ("protocol", "dataset", "case", "method", "views", "status", "sentence")
 #: p below -> stars, as in the paper's figures.
 STARS = ((0.0001, "****"), (0.001, "***"), (0.01, "**"), (0.05, "*"))
@@ -161,7 +165,7 @@ def markdown(rows: Sequence[Mapping[str, Any]], reference: str | None = None) ->
         columns = {
             name: column
             for name, column in {**MEASURES, **COUNTS}.items()
-            if name != "shifted_dsc" or any(entry[name]["n"] for entry in group)
+            if name not in SOME or any(entry[name]["n"] for entry in group)
         }
         out.append(f"### {protocol} protocol, {views} views, {cases} cases\n")
         out.append("| " + " | ".join(["method", *(c.heading for c in columns.values())]) + " |")

@@ -7,6 +7,7 @@ import cv2
 import nibabel
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from gcar_deploy.errors import ModelError, RefusedError, UsageError
 from gcar_export.evaluate import engines as evaluation_engines
@@ -87,6 +88,54 @@ def test_cases_are_consistent(data):
         make_case(label, "papers")
     with pytest.raises(UsageError):
         make_case(label, "paper", views=1)
+
+
+@pytest.mark.parametrize(("protocol", "pitch", "side"), [
+    ("common-lca", 0.65, 0), ("common-rca", 0.55, 1),
+])  # fmt: skip
+def test_the_common_protocol_shows_masks_of_one_artery_at_its_centroid(data, protocol, pitch, side):
+    label = read_label(data / "imagecas" / "1.label.nii.gz")
+    case = make_case(label, protocol)
+    assert case.grid.spacing_mm == pytest.approx(0.5)
+    filled = case.grid.index2world(np.argwhere(case.truth >= 0.5))
+    assert np.abs(filled.mean(axis=0)).max() < 0.25  # voxels of 0.5 mm
+    assert len(filled) == pytest.approx((label.left_right()[side].occupancy > 0).sum(), rel=0.05)
+    for view, picture in zip(case.scene.views, case.pictures, strict=True):
+        assert view.intensity.kind == "mask" and set(np.unique(picture)) == {0, 255}
+        assert view.carm.pixel_spacing_mm == (pitch, pitch)
+        assert (view.carm.sod_mm, view.carm.sdd_mm, view.carm.rows) == (750, 900, 256)
+        # the silhouette of the voxels, no more than half a pixel wider
+        pixels = np.rint(view.carm.project(filled)[0]).astype(int)
+        assert (picture[pixels[:, 1], pixels[:, 0]] > 0).mean() > 0.97
+        near = np.zeros(picture.shape, bool)
+        near[pixels[:, 1], pixels[:, 0]] = True
+        assert not ((picture > 0) & (ndimage.binary_dilation(near, iterations=2) == 0)).any()
+    with pytest.raises(UsageError, match="two views"):
+        make_case(label, protocol, views=4)
+
+
+def test_the_common_protocol_is_measured_as_its_peers_are(data, tmp_path, monkeypatch):
+    label = data / "imagecas" / "1.label.nii.gz"
+    truth = make_case(read_label(label), "common-rca").truth.copy()
+    truth[5:8, 5:8, 5:8] = 1.0  # a second component, far from the artery
+    PerfectEngine.answers = {"volume": lambda views: truth}
+    monkeypatch.setattr("gcar_deploy.engine.Engine", PerfectEngine)
+    methods._session.cache_clear()
+    options = evaluate.EvaluateOptions(
+        data=data, out=tmp_path, protocol="common", methods=("ours",), cases=("1",),
+        settings=MethodSettings(),
+    )  # fmt: skip
+    assert options.protocols == ("common-lca", "common-rca")
+    rows = {row["protocol"]: row["measures"] for row in evaluate.evaluate(options)}
+    methods._session.cache_clear()
+    right = rows["common-rca"]
+    assert right["parts"] == 2 and right["dsc"] > 0.99
+    assert right["cd_mm"] == pytest.approx(2 * right["chamfer_mm"]) and right["cd_mm"] > 0.1
+    assert rows["common-lca"]["dsc"] < 0.4
+    text = (tmp_path / "tables.md").read_text()
+    for words in ("### common-lca", "### common-rca", "other cases of the same set", "DeepCA"):
+        assert words in text
+    assert "new-proj." not in text and "SSIM" not in text
 
 
 @pytest.mark.parametrize("views", [2, 4, 8, 16])
