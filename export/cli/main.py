@@ -125,7 +125,7 @@ def pair_time(label: Path, repeats: int) -> None:
     help="The predictor that sees all views, or the paper's that sees one.",
 )
 @click.option(
-    "--preset", type=click.Choice(["cpu", "gpu", "tiny"]), default="cpu", show_default=True
+    "--preset", type=click.Choice(["cpu", "gpu", "tune", "tiny"]), default="cpu", show_default=True
 )
 @click.option("--steps", type=click.IntRange(1), help="Steps in all; overrides the preset.")
 @click.option("--decay-steps", type=click.IntRange(1), help="Length of the final linear decay.")
@@ -137,6 +137,10 @@ def pair_time(label: Path, repeats: int) -> None:
     type=_FOLDER,
     help="Label volumes of your own (.nii, .nii.gz, .nrrd, .mha, .mhd): half of the scenes.",
 )
+@click.option(
+    "--learning-rate", type=click.FloatRange(0, 1, min_open=True), help="The preset's otherwise."
+)
+@click.option("--warm-start", type=_FILE, help="Go on from the weights of this model (.onnx).")
 def train(
     out: Path,
     network: str,
@@ -145,6 +149,8 @@ def train(
     decay_steps: int | None,
     minutes: float | None,
     labels: Path | None,
+    learning_rate: float | None,
+    warm_start: Path | None,
 ) -> None:
     """Train a predictor on generated trees; stop and go on at will.
 
@@ -153,8 +159,9 @@ def train(
     from gcar_export.training.train import start
 
     start(
-        out, network, preset, steps=steps, decay_steps=decay_steps, minutes=minutes, labels=labels
-    )
+        out, network, preset, steps=steps, decay_steps=decay_steps, minutes=minutes, labels=labels,
+        learning_rate=learning_rate, warm_start=warm_start,
+    )  # fmt: skip
 
 
 @main.command()
@@ -216,18 +223,20 @@ def golden(model: Path, force: bool) -> None:
 @click.option(
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
 )
-@click.option("--count", default=30, show_default=True, help="Generated trees.")
+@click.option("--count", default=30, show_default=True, help="Generated trees of each style.")
 def tree_table(data: Path | None, count: int) -> None:
     """Compare generated trees with real ones, figure by figure.
 
     Example: gcar-export tree-table --data data
     """
-    from gcar_export.studies.tree_table import generated_statistics, real_statistics, table
+    from gcar_export.studies.tree_table import STYLES, generated_statistics, real_statistics, table
 
     real = sorted((data / "imagecas").glob("*.label.nii.gz")) if data else []
-    with click.progressbar(range(count), label="generated", file=sys.stderr) as seeds:
-        generated = [generated_statistics(seed) for seed in seeds]
-    click.echo(table(generated, [real_statistics(path) for path in real]))
+    columns = {}
+    for style in STYLES:
+        with click.progressbar(range(count), label=style, file=sys.stderr) as seeds:
+            columns[style] = [generated_statistics(seed, style) for seed in seeds]
+    click.echo(table({**columns, "real": [real_statistics(path) for path in real]}))
 
 
 @main.command("lumen-table")

@@ -22,8 +22,10 @@ from gcar_deploy.predict.encoding import (
     flat_inputs,
     input_names,
 )
+from gcar_export.scenes.gantry import USUAL_SPREAD_DEG, USUAL_VIEWS
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
-from gcar_export.training.dataset import USUAL_SPREAD_DEG, USUAL_VIEWS, training_scene
+from gcar_export.training.dataset import training_scene
+from gcar_export.training.examinations import FINE_CELLS_MM, PAPER_CELLS_MM
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 
@@ -162,7 +164,7 @@ def _spec(
             "kind": "multi",
             "inputs": {"view_features": VIEW_FEATURES, "levels": LEVELS, "net_pixels": 128},
             "outputs": ["confidence", "offset_cells x y z", "radius_cells"],
-            "spacing_mm": [0.85, 1.5],
+            "spacing_mm": [FINE_CELLS_MM[0], PAPER_CELLS_MM[1]],
             "geometry": "2 views or more, 25 .. 155 deg apart",
         }
     config = net.config

@@ -59,9 +59,8 @@ def confidences(predictor: Predictor, scene: TrainingScene) -> Scalars:
             seen, scene.hull, scene.encoded, options.candidates, options.predict.single
         )
         return merged.confidence
-    error = 0.0 if all(known for _, _, known in scene.views) else options.imaging.contrast_error
     found = predictor.predict(scene.hull, scene.encoded)
-    return decide(found, scene.encoded, error, options.decide).confidence
+    return decide(found, scene.encoded, scene.path_error, options.decide).confidence
 
 
 class _TorchSession:

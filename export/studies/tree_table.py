@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +15,25 @@ from gcar_deploy.predict.hull import visual_hull
 from gcar_export.evaluate.protocols import make_case
 from gcar_export.scenes.labels import from_array, read_label
 from gcar_export.scenes.render import occupancy
-from gcar_export.scenes.trees import random_tree
+from gcar_export.scenes.trees import TreeStyle, random_tree, rough_style, thin_style
 
 #: voxel of the lattice on which both kinds are measured, mm
 VOXEL_MM = 0.7
+#: kinds of generated trees that training draws
+STYLES: Mapping[str, Callable[[np.random.Generator], TreeStyle]] = {
+    "label-like": lambda rng: TreeStyle(),
+    "rough": rough_style,
+    "thin": thin_style,
+}
+#: a thin vessel's radius, mm: hardly wider than the voxel
+THIN_MM = 0.6
 ROWS = (
     ("volume_mm3", "vessel volume, mm^3"),
     ("length_mm", "centreline length, mm"),
     ("radius_mm", "median radius, mm"),
     ("radius_10_mm", "10 % radius, mm"),
     ("radius_90_mm", "90 % radius, mm"),
+    ("thin_share", f"share of length thinner than {THIN_MM:g} mm radius"),
     ("ends", "ends"),
     ("box_mm", "longest edge of the box, mm"),
     ("candidates", "hull cells per vessel cell (0/90 deg, 1.4 mm)"),
@@ -58,15 +68,17 @@ def statistics(occupied: np.ndarray, affine_ras: np.ndarray, spacing_mm: float) 
         "radius_mm": float(np.median(radius)),
         "radius_10_mm": float(np.percentile(radius, 10)),
         "radius_90_mm": float(np.percentile(radius, 90)),
+        "thin_share": float((radius < THIN_MM).mean()),
         "ends": float((mask & (around == 2)).sum()),
         "box_mm": float(np.ptp(where, axis=0).max() * spacing_mm),
         "candidates": float(len(hull) / max(int((case.truth >= 0.5).sum()), 1)),
     }
 
 
-def generated_statistics(seed: int) -> dict[str, float]:
-    """Voxelise one generated tree and measure it."""
-    starts, ends, radii = random_tree(np.random.default_rng(seed)).segments()
+def generated_statistics(seed: int, style: str = "label-like") -> dict[str, float]:
+    """Voxelise one generated tree and measure it; what is thinner than a voxel from its radii."""
+    rng = np.random.default_rng(seed)
+    starts, ends, radii = random_tree(rng, STYLES[style](rng)).segments()
     half = float(np.abs(np.concatenate([starts, ends])).max()) + 4.0
     n = int(2 * half / VOXEL_MM)
     grid = Grid(center_mm=(0, 0, 0), size_mm=(n * VOXEL_MM,) * 3, shape=(n,) * 3)
@@ -74,7 +86,9 @@ def generated_statistics(seed: int) -> dict[str, float]:
     share, _, _ = occupancy(grid.index2world(index), VOXEL_MM, starts, ends, radii, sub=2)
     occupied = np.zeros(grid.shape, bool)
     occupied[tuple(index.T)] = share >= 0.5
-    return statistics(occupied, grid.affine_ras(), VOXEL_MM)
+    length = np.linalg.norm(ends - starts, axis=1)
+    thin = float(length[radii < THIN_MM].sum() / length.sum())
+    return statistics(occupied, grid.affine_ras(), VOXEL_MM) | {"thin_share": thin}
 
 
 def _near(starts: np.ndarray, ends: np.ndarray, grid: Grid) -> np.ndarray:
@@ -100,13 +114,15 @@ def real_statistics(path: Path) -> dict[str, float]:
     return statistics(occupied, grid.affine_ras(), VOXEL_MM)
 
 
-def table(generated: list[dict[str, float]], real: list[dict[str, float]]) -> str:
-    """Markdown: mean (lowest .. highest) of each figure for both kinds."""
-    out = [f"| | generated ({len(generated)}) | real ({len(real)}) |", "|---|---|---|"]
+def table(columns: Mapping[str, list[dict[str, float]]]) -> str:
+    """Markdown: mean (lowest .. highest) of each figure, one column per kind of tree."""
+    shown = {name: rows for name, rows in columns.items() if rows}
+    out = ["| |" + "".join(f" {name} ({len(rows)}) |" for name, rows in shown.items())]
+    out.append("|---|" + "---|" * len(shown))
     for key, name in ROWS:
         cells = []
-        for rows in (generated, real):
+        for rows in shown.values():
             v = [r[key] for r in rows]
-            cells.append(f"{np.mean(v):.4g} ({min(v):.4g} .. {max(v):.4g})" if v else "-")
-        out.append(f"| {name} | {cells[0]} | {cells[1]} |")
+            cells.append(f" {np.mean(v):.4g} ({min(v):.4g} .. {max(v):.4g}) |")
+        out.append(f"| {name} |" + "".join(cells))
     return "\n".join(out)

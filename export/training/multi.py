@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -20,9 +21,13 @@ import torch
 import torch.distributed
 import torch.multiprocessing
 
-from gcar_export.training.dataset import LabelTree, SceneOptions, TrainingScene, training_scene
+from gcar_deploy.errors import ModelError
+from gcar_export.training.dataset import TrainingScene, training_scene
+from gcar_export.training.examinations import LabelTree, SceneOptions
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.run_folder import ProgressLine, RunFolder
+from gcar_export.training.scene_stream import in_order
+from gcar_export.training.warm_start import predictor_of
 
 #: scenes with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_001
@@ -34,8 +39,8 @@ class TrainOptions:
     """Optimiser settings; the schedule is warm-up, constant, then linear to zero."""
 
     seed: int = 1
-    steps: int = 5_250
-    decay_steps: int = 3_250
+    steps: int = 24_000
+    decay_steps: int = 14_000
     replicas: int = 2
     warmup_steps: int = 200
     learning_rate: float = 1.5e-3
@@ -47,12 +52,26 @@ class TrainOptions:
     #: forward pass in bfloat16; the loss stays in float32
     bf16: bool = False
     compiled: bool = False
+    #: processes per replica that draw scenes ahead; 0 draws each when its turn comes
+    workers: int = 0
 
 
 PRESETS = {
     "cpu": TrainOptions(),
+    #: 40 minutes of a device that is fed by 16 cores
     "gpu": TrainOptions(
-        steps=120_000, decay_steps=30_000, replicas=1, device="cuda", bf16=True, compiled=True
+        steps=60_000,
+        decay_steps=30_000,
+        replicas=1,
+        device="cuda",
+        bf16=True,
+        compiled=True,
+        workers=14,
+        save_every=2_000,
+    ),
+    #: from a model that is there (``warm_start``)
+    "tune": TrainOptions(
+        steps=4_000, decay_steps=3_800, warmup_steps=100, learning_rate=4e-4, save_every=120
     ),
     "tiny": TrainOptions(
         replicas=1, steps=4, decay_steps=2, warmup_steps=1, validation_scenes=2, save_every=2
@@ -62,6 +81,7 @@ PRESETS = {
 CONFIGS = {
     "cpu": SparseConfig(),
     "gpu": SparseConfig(),
+    "tune": SparseConfig(),
     "tiny": SparseConfig(width=(3, 2, 2, 2), stages=1, ray_width=1),
 }
 
@@ -147,6 +167,7 @@ class _Job:
     until: float | None
     labels: tuple[LabelTree, ...]
     label_hashes: Mapping[str, str]
+    warm_start: Path | None = None
     port: int = 0
 
 
@@ -158,8 +179,11 @@ def train(
     until: float | None = None,
     labels: Sequence[LabelTree] = (),
     label_hashes: Mapping[str, str] | None = None,
+    warm_start: Path | None = None,
 ) -> None:
     """Train or go on training in ``out``; stop after ``until`` seconds if given.
+
+    The first step begins from random weights, or from those of the model ``warm_start``.
 
     Each step takes one scene per replica; replicas are processes of one thread each, which
     uses cores better than threads do on scenes of this size, and their gradients are averaged.
@@ -167,11 +191,14 @@ def train(
     Raises
     ------
     UsageError
-        ``out`` holds a run of another network, size, seed or set of labels.
+        ``out`` holds a run of another network, size, seed, set of labels or first weights.
+    ModelError
+        ``warm_start`` is no multi-view predictor, or one of another size.
     """
     job = _Job(
-        out, options, config or SparseConfig(), until, tuple(labels), dict(label_hashes or {})
-    )
+        out, options, config or SparseConfig(), until, tuple(labels), dict(label_hashes or {}),
+        warm_start,
+    )  # fmt: skip
     _run_folder(job)
     if options.replicas == 1:
         _replica(0, job)
@@ -194,7 +221,7 @@ def _replica(rank: int, job: _Job) -> None:
         )
     run = _run_folder(job)
     torch.manual_seed(options.seed)
-    net = SparsePredictor(job.config).to(options.device).train()
+    net = _first_network(job).to(options.device).train()
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
@@ -208,35 +235,50 @@ def _replica(rank: int, job: _Job) -> None:
     forward = torch.compile(net, dynamic=True) if options.compiled else net
     line = ProgressLine(step, options.steps, options.replicas, "scenes")
     began, losses = time.monotonic(), []
-    while step < options.steps:
-        out_of_time = job.until is not None and time.monotonic() - began > job.until
-        if _any(out_of_time, options.replicas):
-            break
-        scene = training_scene(options.seed, step * options.replicas + rank, scenes, job.labels)
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(options, step)
-        with _precision(options):
-            outputs = forward(*inputs(scene, options.device))
-        loss = scene_loss([o.float() for o in outputs], scene)
-        optimiser.zero_grad()
-        loss.backward()
-        _average(net, options.replicas)
-        norm = torch.nn.utils.clip_grad_norm_(net.parameters(), options.clip)
-        if bool(torch.isfinite(norm)):
-            optimiser.step()
-        losses.append(float(loss.detach()))
-        step += 1
-        if rank == 0:
-            line.show(step, losses)
-        if rank == 0 and (step % options.save_every == 0 or step == options.steps):
-            scores = validate(net, held_out)
-            run.save(net, optimiser, step, {"validation": scores})
-            run.log(step, float(np.mean(losses[-250:])), scores)
-            _tell(step, scores)
+    draw = functools.partial(training_scene, options.seed, options=scenes, labels=job.labels)
+    numbers = range(
+        step * options.replicas + rank, options.steps * options.replicas, options.replicas
+    )
+    with in_order(draw, numbers, options.workers) as drawn:
+        while step < options.steps:
+            out_of_time = job.until is not None and time.monotonic() - began > job.until
+            if _any(out_of_time, options.replicas):
+                break
+            scene = next(drawn)
+            for group in optimiser.param_groups:
+                group["lr"] = learning_rate(options, step)
+            with _precision(options):
+                outputs = forward(*inputs(scene, options.device))
+            loss = scene_loss([o.float() for o in outputs], scene)
+            optimiser.zero_grad()
+            loss.backward()
+            _average(net, options.replicas)
+            norm = torch.nn.utils.clip_grad_norm_(net.parameters(), options.clip)
+            if bool(torch.isfinite(norm)):
+                optimiser.step()
+            losses.append(float(loss.detach()))
+            step += 1
+            if rank == 0:
+                line.show(step, losses)
+            if rank == 0 and (step % options.save_every == 0 or step == options.steps):
+                scores = validate(net, held_out)
+                run.save(net, optimiser, step, {"validation": scores})
+                run.log(step, float(np.mean(losses[-250:])), scores)
+                _tell(step, scores)
     if rank == 0:
         run.save(net, optimiser, step)
     if options.replicas > 1:
         torch.distributed.destroy_process_group()
+
+
+def _first_network(job: _Job) -> SparsePredictor:
+    net = SparsePredictor(job.config)
+    if job.warm_start is not None:
+        first, _ = predictor_of(job.warm_start)
+        if first.config != job.config:
+            raise ModelError(f"{job.warm_start.name} holds {first.config}, not {job.config}")
+        net.load_state_dict(first.state_dict())
+    return net
 
 
 def _run_folder(job: _Job) -> RunFolder:
@@ -249,6 +291,7 @@ def _run_folder(job: _Job) -> RunFolder:
             "options": dataclasses.asdict(job.options),
             "scenes": dataclasses.asdict(SceneOptions()),
             "labels": dict(job.label_hashes),
+            "warm_start": None if job.warm_start is None else predictor_of(job.warm_start)[1],
             "data": f"{'generated trees and label volumes' if job.labels else GENERATED}: "
             "scene step * replicas + rank of the seed",
             "validation_seed": VALIDATION_SEED,

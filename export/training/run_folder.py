@@ -27,7 +27,7 @@ from gcar_deploy.errors import UsageError
 
 SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from
-FIXED = ("network", "config", "seed", "labels")
+FIXED = ("network", "config", "seed", "labels", "warm_start")
 
 
 class RunFolder:
@@ -42,7 +42,7 @@ class RunFolder:
     Raises
     ------
     UsageError
-        The folder holds a run of another network, size, seed or set of labels.
+        The folder holds a run of another network, size, seed, set of labels or first weights.
     """
 
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:

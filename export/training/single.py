@@ -19,10 +19,10 @@ import torch
 
 from gcar_deploy.predict.center_map import DEPTH_PIXELS, decode
 from gcar_export.training import losses
-from gcar_export.training.dataset import LabelTree, SceneOptions
+from gcar_export.training.examinations import LabelTree, SceneOptions
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.run_folder import ProgressLine, RunFolder
-from gcar_export.training.single_dataset import VIEWS, TrainingPicture, training_pictures
+from gcar_export.training.single_dataset import SCENES, VIEWS, TrainingPicture, training_pictures
 
 #: trees with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -215,7 +215,7 @@ def train(
     UsageError
         ``out`` holds a run of another network, size, seed or set of labels.
     """
-    scenes = SceneOptions()
+    scenes = SCENES
     run = RunFolder(out, _manifest(options, config, scenes, label_hashes or {}))
     torch.manual_seed(options.seed)
     net = UNetPredictor(config).to(options.device)

@@ -20,12 +20,19 @@ from gcar_deploy.predict.center_map import (
     net_picture,
 )
 from gcar_deploy.types import Array
+from gcar_export.scenes.pictures import degrade
 from gcar_export.scenes.render import path_and_depth
-from gcar_export.training.dataset import LabelTree, SceneOptions, degrade, examination, picture
+from gcar_export.training.dataset import picture
+from gcar_export.training.examinations import LabelTree, SceneOptions, examination
 from gcar_export.training.networks.unet import UNetConfig
 
 #: views taken of each drawn tree
 VIEWS = 2
+#: label-like trees as they lie in the patient, exact paths or what grey values leave of them
+SCENES = SceneOptions(
+    paper_share=0.45, fine_share=0.0, inputs=(0.65, 0.0, 0.35, 0.0), thin_share=0.0,
+    rough_share=0.0, oval_share=0.0,
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,15 +63,15 @@ def training_pictures(
     labels: Sequence[LabelTree] = (),
 ) -> list[TrainingPicture]:
     """Draw tree ``i`` and its ``VIEWS`` pictures; draws again where a picture is empty."""
-    options = options or SceneOptions()
+    options = options or SCENES
     for attempt in range(20):
         rng = np.random.default_rng([seed, i, attempt, 1])
         drawn = examination(rng, options, labels, usual=True)
         if drawn is None:
             continue
-        exact = rng.random() < options.exact_share
+        exact = rng.random() < options.inputs[0]
         tree = drawn.tree.moved(rng.uniform(-4, 4, size=3))
-        kind = ("paper" if drawn.paper else "clinical") + ("" if exact else "-degraded")
+        kind = drawn.regime + ("" if exact else "-degraded")
         out = []
         for carm in drawn.carms[:VIEWS]:
             path = picture(rng, carm, tree)

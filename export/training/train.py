@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import UsageError
-from gcar_export.training.dataset import LabelTree
+from gcar_export.training.examinations import LabelTree
 
 NETWORKS = ("multi", "single")
 
@@ -19,8 +19,10 @@ def start(
     *,
     steps: int | None = None,
     decay_steps: int | None = None,
+    learning_rate: float | None = None,
     minutes: float | None = None,
     labels: Path | None = None,
+    warm_start: Path | None = None,
 ) -> None:
     """Train ``network`` with a preset, some of its numbers replaced.
 
@@ -28,37 +30,40 @@ def start(
     ----------
     out : folder of the run; a run that is there goes on
     network : ``multi`` or ``single``
-    preset : ``cpu``, ``gpu`` or ``tiny``
-    steps, decay_steps : replace the preset's
+    preset : ``cpu``, ``gpu``, ``tune`` (multi alone) or ``tiny``
+    steps, decay_steps, learning_rate : replace the preset's
     minutes : stop after so long
     labels : folder of label volumes (NIfTI, NRRD, MetaImage) that half of the scenes show
+    warm_start : model (.onnx) whose weights are the first, multi alone
 
     Raises
     ------
     UsageError
-        No CUDA device for ``gpu``; unreadable labels; ``out`` holds another run.
+        No CUDA device for ``gpu``; unreadable labels; ``out`` holds another run; a preset or a
+        warm start that the network does not have.
     """
     from gcar_export.training import multi as train_multi
     from gcar_export.training import single as train_single
 
     if network not in NETWORKS:
         raise UsageError(f"network {network!r} is none of {', '.join(NETWORKS)}")
+    if network == "single" and (preset == "tune" or warm_start is not None):
+        raise UsageError("network single starts from random weights: no preset tune, no warm start")
     trees: list[LabelTree] = []
     hashes: dict[str, str] = {}
     if labels is not None:
         from gcar_export.scenes.label_trees import read_label_trees
 
         trees, hashes = read_label_trees(labels)
-    changes: dict[str, Any] = {
-        k: v for k, v in (("steps", steps), ("decay_steps", decay_steps)) if v
-    }
+    asked = {"steps": steps, "decay_steps": decay_steps, "learning_rate": learning_rate}
+    changes: dict[str, Any] = {k: v for k, v in asked.items() if v}
     until = minutes * 60 if minutes else None
     if network == "multi":
         options = dataclasses.replace(train_multi.PRESETS[preset], **changes)
         _check_device(options.device)
         train_multi.train(
             out, options, train_multi.CONFIGS[preset], until=until, labels=trees,
-            label_hashes=hashes,
+            label_hashes=hashes, warm_start=warm_start,
         )  # fmt: skip
     else:
         single = dataclasses.replace(train_single.PRESETS[preset], **changes)

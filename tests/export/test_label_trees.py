@@ -17,7 +17,8 @@ from gcar_export.scenes.raycast import raycast
 from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.training import multi as train_multi
 from gcar_export.training import single as train_single
-from gcar_export.training.dataset import Capsules, SceneOptions, training_scene
+from gcar_export.training.dataset import training_scene
+from gcar_export.training.examinations import Capsules, SceneOptions
 from gcar_export.training.single_dataset import training_pictures
 from gcar_export.training.train import start
 

@@ -1,14 +1,22 @@
 """Scenes, losses, training that resumes to the bit, and the way from checkpoint to ONNX."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from gcar_deploy.errors import ModelError, UsageError
+from gcar_deploy.models.session import Session
+from gcar_deploy.models.spec import read_model, shipped_model_path
+from gcar_deploy.predict.encoding import flat_inputs, input_names
+from gcar_deploy.predict.kinds import MULTI
+from gcar_export.shipping.export_onnx import DeployedSparse
 from gcar_export.shipping.tiny_model import TINY
 from gcar_export.training.dataset import training_scene
+from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.multi import (
     CONFIGS,
     PRESETS,
@@ -19,6 +27,8 @@ from gcar_export.training.multi import (
     train,
 )
 from gcar_export.training.networks.sparse import SparsePredictor
+from gcar_export.training.run_folder import load_weights
+from gcar_export.training.scene_stream import in_order
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +55,7 @@ def test_truth_lies_on_the_hull(scenes):
 
 
 def test_views_of_the_truth_explain_the_pictures():
-    exact = next(s for s in (training_scene(11, i) for i in range(9)) if "degraded" not in s.kind)
+    exact = training_scene(11, 0, SceneOptions(inputs=(1.0, 0.0, 0.0, 0.0), thin_share=0.0))
     e = exact.encoded
     made = np.bincount(e.ray[0], exact.occupancy * e.weight[0], minlength=e.ray_path.shape[1])
     assert made.sum() == pytest.approx(e.ray_path[0].sum(), rel=0.35)
@@ -127,3 +137,35 @@ def test_a_step_in_bfloat16_stays_near_one_in_float32(tmp_path):
     for key in a:
         if key.startswith("net."):
             torch.testing.assert_close(a[key], b[key], atol=2 * one.learning_rate, rtol=0.05)
+
+
+def test_a_training_may_begin_from_a_model(tmp_path):
+    shipped = shipped_model_path("gcp-multi")
+    train(tmp_path, PRESETS["tiny"], CONFIGS["cpu"], until=0.0, warm_start=shipped)
+    net, scene = DeployedSparse(SparsePredictor(CONFIGS["cpu"])), training_scene(7, 0).encoded
+    load_weights(net.net, load_file(tmp_path / "checkpoint.safetensors"))
+    arrays = flat_inputs(scene)
+    with torch.no_grad():
+        ours = net.eval()(*[torch.from_numpy(x) for x in arrays]).numpy()
+    model = Session(read_model(shipped, (MULTI,)), input_names(), threads=1)
+    theirs = model.answers(dict(zip(input_names(), arrays, strict=True)))["centers"]
+    np.testing.assert_allclose(ours, theirs, atol=1e-4)
+    with pytest.raises(UsageError, match="warm_start"):
+        train(tmp_path, PRESETS["tiny"], CONFIGS["cpu"], until=0.0)
+
+
+def test_a_warm_start_of_another_size_is_refused(tmp_path):
+    with pytest.raises(ModelError, match=r"gcp-multi.onnx holds .* not"):
+        train(
+            tmp_path, PRESETS["tiny"], TINY, until=0.0, warm_start=shipped_model_path("gcp-multi")
+        )
+
+
+def test_scenes_drawn_ahead_are_those_drawn_here():
+    draw = functools.partial(training_scene, 7)
+    with in_order(draw, range(1, 4), 0) as here, in_order(draw, range(1, 4), 1) as ahead:
+        pairs = list(zip(here, ahead, strict=True))
+    assert len(pairs) == 3
+    for a, b in pairs:
+        np.testing.assert_array_equal(a.encoded.features, b.encoded.features)
+        np.testing.assert_array_equal(a.occupancy, b.occupancy)

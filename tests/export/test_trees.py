@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gcar_export.scenes.trees import MURRAY, random_tree
+from gcar_export.scenes.tree_curves import MURRAY
+from gcar_export.scenes.trees import random_tree, rough_style, thin_style
 
 
 def test_same_seed_same_tree_other_seed_other_tree():
@@ -43,3 +44,40 @@ def test_side_branches_start_on_their_tree():
     for v in tree.vessels:
         if v.name.startswith(("D", "OM", "S")) and not v.name.endswith("a"):
             assert np.linalg.norm(trunk - v.points_mm[0], axis=1).min() < 2.0
+
+
+def lengths_and_radii(seed, draw):
+    rng = np.random.default_rng(seed)
+    starts, ends, radii = random_tree(rng, draw(rng) if draw else None).segments()
+    return np.linalg.norm(ends - starts, axis=1), radii
+
+
+def test_thin_trees_reach_a_quarter_of_a_millimetre_and_keep_their_trunks():
+    thin = [lengths_and_radii(seed, thin_style) for seed in range(20)]
+    share = [length[radii < 0.5].sum() / length.sum() for length, radii in thin]
+    assert 0.1 < np.mean(share) < 0.5
+    assert min(radii.min() for _, radii in thin) == pytest.approx(0.22)
+    assert np.mean([np.percentile(radii, 95) for _, radii in thin]) > 1.3
+    usual = [lengths_and_radii(seed, None) for seed in range(20)]
+    assert np.mean([r.size for _, r in thin]) > 1.15 * np.mean([r.size for _, r in usual])
+
+
+def test_thin_trees_have_twice_as_many_vessels():
+    def count(draw):
+        drawn = [np.random.default_rng(seed) for seed in range(20)]
+        return np.mean(
+            [len(random_tree(rng, draw(rng) if draw else None).vessels) for rng in drawn]
+        )
+
+    assert count(thin_style) > 1.9 * count(None)
+
+
+@pytest.mark.parametrize("draw", [thin_style, rough_style])
+def test_branches_stay_attached_when_space_winds(draw):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        tree = random_tree(rng, draw(rng)).sides("left")
+        for k, v in enumerate(tree.vessels):
+            others = [w.points_mm for j, w in enumerate(tree.vessels) if j != k]
+            gap = np.linalg.norm(np.concatenate(others) - v.points_mm[0], axis=1).min()
+            assert v.name == "LM" or gap < 2.5

@@ -1,0 +1,48 @@
+"""Scenes in the order of their numbers, drawn ahead by other processes where asked."""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import contextlib
+import itertools
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+#: scenes drawn ahead per worker
+AHEAD = 3
+
+
+@contextlib.contextmanager
+def in_order(
+    draw: Callable[[int], T], numbers: Iterable[int], workers: int
+) -> Iterator[Iterator[T]]:
+    """Give an iterator over ``draw(i)`` for every i of ``numbers``, in order.
+
+    Parameters
+    ----------
+    draw : a function of the number alone, picklable where there are workers
+    numbers : may be endless
+    workers : processes that draw ahead; 0 draws here, when asked
+    """
+    if workers == 0:
+        yield map(draw, numbers)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    pool = concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn)
+    try:
+        yield _ahead(pool, draw, iter(numbers), AHEAD * workers)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ahead(
+    pool: concurrent.futures.Executor, draw: Callable[[int], T], numbers: Iterator[int], most: int
+) -> Iterator[T]:
+    waiting = collections.deque(pool.submit(draw, i) for i in itertools.islice(numbers, most))
+    while waiting:
+        found = waiting.popleft().result()
+        waiting.extend(pool.submit(draw, i) for i in itertools.islice(numbers, 1))
+        yield found
