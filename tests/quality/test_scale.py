@@ -1,0 +1,122 @@
+"""Scale, duplicates and human ranges: what pictures themselves say against their calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from gcar_deploy.errors import RefusedError
+from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.quality.duplicates import check_duplicates
+from gcar_deploy.quality.human_range import check_human_range
+from gcar_deploy.quality.scale import check_scale, scale_factor
+from gcar_deploy.selftest import tiny_case
+from gcar_deploy.tree.tree import Branch, Tree
+
+CARM = CArm(
+    primary_angle_deg=-30, secondary_angle_deg=20, sod_mm=765, sdd_mm=1100, rows=512, columns=512,
+    pixel_spacing_mm=(0.39, 0.39),
+)  # fmt: skip
+
+
+def tube(direction, radius=1.5, length=60.0, middle=(0.0, 0.0, 0.0)):
+    t = np.linspace(-length / 2, length / 2, 61)[:, None]
+    points = np.asarray(middle) + t * np.asarray(direction) / np.linalg.norm(direction)
+    full = np.full(len(points), float(radius))
+    branch = Branch(
+        points_mm=points, radius_mm=full, sigma_mm=0 * full, confidence=full, start=0, end=1
+    )
+    return Tree(nodes_mm=points[[0, -1]], branches=(branch,))
+
+
+def picture(tree, carm=CARM, factor=1.0, radius=None):
+    """Path lengths by sampling each pixel's ray: no code of the refinement takes part."""
+    cols, rows = np.meshgrid(np.arange(carm.columns), np.arange(carm.rows))
+    a, b = tree.branches[0].points_mm[[0, -1]]
+    r = tree.branches[0].radius_mm[0] if radius is None else radius
+    source, (fc, fr) = carm.source_mm, carm.focal_px
+    c0, r0 = (carm.columns - 1) / 2, (carm.rows - 1) / 2
+    u, v, d = carm.axes
+    ray = ((cols - c0) / fc)[..., None] * u + ((rows - r0) / fr)[..., None] * v + d
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    axis = (b - a) / np.linalg.norm(b - a)
+    # Infinite cylinder: quadratic in the distance along the ray.
+    o = source - a
+    dp, op = ray - (ray @ axis)[..., None] * axis, o - (o @ axis) * axis
+    A, B, C = (dp * dp).sum(-1), dp @ op, op @ op - r * r
+    chord = 2 * np.sqrt(np.maximum(B * B - A * C, 0)) / A
+    chord[np.abs((source + ray * (-(B / A))[..., None] - a) @ axis - 30) > 30] = 0
+    path = (factor * chord).astype(np.float32)
+    mask = path > 0
+    return VesselImage(
+        view_id="1", carm=carm, path_mm=path, path_error=0.0, mask=mask, skeleton=mask,
+        valid=np.ones_like(mask), kind="path_length",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("radius", [0.8, 1.5, 2.5])
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.15, 2.0])
+def test_the_factor_of_a_round_tube_is_found(radius, factor):
+    tree = tube((0.3, 0.5, 1.0), radius)
+    found = scale_factor(tree, picture(tree, factor=factor))
+    assert found == pytest.approx(factor, rel=0.06)
+
+
+def test_the_radii_of_the_tree_take_no_part():
+    tree = tube((0.3, 0.5, 1.0), 1.5)
+    wrong = tube((0.3, 0.5, 1.0), 2.2)
+    assert scale_factor(wrong, picture(tree)) == pytest.approx(1.0, rel=0.06)
+
+
+def test_right_scales_pass_and_wrong_ones_are_named():
+    tree = tube((1.0, 0.2, 0.6))
+    assert check_scale(tree, [picture(tree)]) == []
+    (said,) = check_scale(tree, [picture(tree, factor=1.35)])
+    assert "view 1" in said and "mm_per_count" in said and "1.3" in said
+    for factor in (0.5, 2.0, 10.0):
+        with pytest.raises(RefusedError, match="mm_per_count or the pixel spacing"):
+            check_scale(tree, [picture(tree, factor=factor)])
+
+
+def test_pictures_without_calibration_are_not_judged():
+    tree = tube((1.0, 0.2, 0.6))
+    view = dataclasses.replace(picture(tree, factor=3.0), path_error=0.3)
+    assert check_scale(tree, [view]) == []
+
+
+def test_a_vessel_along_the_ray_and_a_short_one_tell_nothing():
+    along = tube(CARM.axes[2])
+    assert scale_factor(along, picture(along)) is None
+    assert scale_factor(Tree(nodes_mm=np.zeros((0, 3)), branches=()), picture(along)) is None
+
+
+@pytest.mark.parametrize("change", ["bytes", "depth", "noise", "half", "grey scale"])
+def test_one_picture_given_twice_is_refused_in_any_bytes(change):
+    (first, second), *_ = tiny_case()
+    pixels = first.pixels
+    if change == "depth":
+        pixels = np.round(pixels / pixels.max() * 255).astype(np.float32)
+    if change == "noise":
+        noise = np.random.default_rng(0).normal(0, 0.01 * pixels.max(), pixels.shape)
+        pixels = np.clip(pixels + noise, 0, None).astype(np.float32)
+    if change == "half":
+        pixels = cv2.resize(pixels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    if change == "grey scale":
+        pixels = 1000 * pixels
+    carm = dataclasses.replace(second.carm, rows=pixels.shape[0], columns=pixels.shape[1])
+    copy = dataclasses.replace(second, pixels=pixels, carm=carm, sha256="other")
+    with pytest.raises(RefusedError, match="same picture"):
+        check_duplicates([first, copy])
+    check_duplicates([first, second])
+
+
+def test_sizes_that_no_human_has_are_doubted():
+    assert check_human_range(tube((0, 0, 1), 2.0, 100.0)) == []
+    assert "mm are usual" in check_human_range(tube((0, 0, 1), 5.0, 100.0))[0]
+    assert "mm are usual" in check_human_range(tube((0, 0, 1), 0.3, 100.0))[0]
+    assert "extends over 300 mm" in check_human_range(tube((0, 0, 1), 2.0, 300.0))[0]
+    assert check_human_range(tube((0, 0, 1), 5.0, 30.0)) == []
