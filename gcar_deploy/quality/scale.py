@@ -2,8 +2,9 @@
 
 Across a round vessel of radius r, tilted by an angle t against the ray, the path length is
 ``2 sqrt(r^2 - x^2) / sin t``: its integral over x is ``pi r^2 / sin t``, its variance ``r^2 / 4``.
-The first hangs on millimetres per count, the second on millimetres per pixel alone, so their ratio is
-the factor between the two. Neither the tree's radii nor a threshold takes part, only its course.
+The first hangs on millimetres per count, the second on millimetres per pixel alone, so their
+ratio is the factor between the two. Neither the tree's radii nor a threshold takes part, only its
+course.
 """
 
 from __future__ import annotations
