@@ -15,6 +15,7 @@ from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.tree.tree import Tree
 
 
@@ -36,12 +37,7 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
     RefusedError
         All views look along nearly one line, or one picture was given twice.
     """
-    for first, second in itertools.combinations(angiograms, 2):
-        if first.sha256 == second.sha256 and first.sha256:
-            raise RefusedError(
-                f"views {first.view_id} and {second.view_id} are the same picture; "
-                "give two different runs"
-            )
+    check_duplicates(angiograms)
     angle = best_separation([angiogram.carm for angiogram in angiograms])
     if angle < options.min_separation_deg:
         raise RefusedError(

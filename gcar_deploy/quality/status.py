@@ -17,6 +17,8 @@ from gcar_deploy.measure.lumen import foreshortening
 from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
 from gcar_deploy.quality.gates import best_separation, disagreement_limits
+from gcar_deploy.quality.human_range import check_human_range
+from gcar_deploy.quality.scale import check_scale
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes import footprint, tubes_of
 from gcar_deploy.types import Array, Mask, Scalars
@@ -102,13 +104,16 @@ def judge(
     Raises
     ------
     RefusedError
-        As ``assess``.
+        As ``assess`` and ``check_scale``.
     """
     open_ = alternatives.exchanges(tree, [view.carm for view in views])
     elsewhere = None if evidence is None else alternatives.evidence_elsewhere(
         tree, evidence.points, evidence.ray, evidence.weight
     )  # fmt: skip
-    findings = [*findings, *alternatives.findings(open_, elsewhere)]
+    findings = [
+        *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
+        *check_human_range(tree),
+    ]  # fmt: skip
     least = options.imaging.path_threshold_pixels
     lumen = [_lumen(tree, v.carm, least * v.carm.pixel_at_isocenter_mm) for v in views]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)

@@ -54,8 +54,8 @@ def test_separation(case, second, outcome):
 
 
 def test_one_good_pair_among_many_views_is_enough(case):
-    first = case[0][0]
-    views = [turned(first, a) for a in (0.0, 1.0, 60.0)]
+    first, second = case[0]
+    views = [turned(first, 0.0), turned(first, 1.0), turned(second, 60.0)]
     assert best_separation([v.carm for v in views]) == pytest.approx(60.0)
     assert check_views(views, OPTIONS) == []
 

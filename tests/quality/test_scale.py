@@ -112,6 +112,8 @@ def test_one_picture_given_twice_is_refused_in_any_bytes(change):
     with pytest.raises(RefusedError, match="same picture"):
         check_duplicates([first, copy])
     check_duplicates([first, second])
+    near = first.carm.turned(2.0, 0.0)
+    check_duplicates([first, dataclasses.replace(first, carm=near, sha256="other")])
 
 
 def test_sizes_that_no_human_has_are_doubted():
@@ -120,3 +122,30 @@ def test_sizes_that_no_human_has_are_doubted():
     assert "mm are usual" in check_human_range(tube((0, 0, 1), 0.3, 100.0))[0]
     assert "extends over 300 mm" in check_human_range(tube((0, 0, 1), 2.0, 300.0))[0]
     assert check_human_range(tube((0, 0, 1), 5.0, 30.0)) == []
+
+
+@pytest.mark.parametrize(("factor", "outcome"), [(1.0, "ok"), (1.35, "degraded"), (2.0, "refused")])
+def test_a_whole_run_judges_the_scale(factor, outcome):
+    """Two views of a tube at 0.27 mm pixels, whose counts are said to mean more than they do."""
+    from gcar_deploy import Engine
+    from gcar_deploy.geometry.grid import Grid
+
+    engine = Engine(threads=1)
+    tree = tube((0.4, 0.3, 1.0), 1.6, 70.0)
+    carms = (CARM, dataclasses.replace(CARM, primary_angle_deg=50, secondary_angle_deg=-10))
+    given = tiny_case()[0][0]
+    pictures = [
+        dataclasses.replace(
+            given, view_id=str(k), carm=carm, sha256=str(k),
+            pixels=(1000 * factor * picture(tree, carm).path_mm).astype(np.float32),
+        )
+        for k, carm in enumerate(carms, start=1)
+    ]  # fmt: skip
+    grid = Grid(center_mm=(0, 0, 0), size_mm=(96, 96, 96), shape=(96, 96, 96))
+    if outcome == "refused":
+        with pytest.raises(RefusedError, match="mm_per_count"):
+            engine.reconstruct(pictures, grid)
+        return
+    result = engine.reconstruct(pictures, grid)
+    assert result.status == outcome, result.quality.sentence
+    assert any("mm_per_count" in f for f in result.quality.findings) == (outcome == "degraded")
