@@ -14,7 +14,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.centerline import build_tree
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Tree, polyline_arc
 from gcar_export.evaluate.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.render import path_lengths
@@ -43,8 +43,7 @@ class Tube:
     @property
     def arc_mm(self) -> np.ndarray:
         """(m,) distance from the first point, mm."""
-        steps = np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return polyline_arc(self.points_mm)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

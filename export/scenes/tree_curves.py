@@ -8,6 +8,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from gcar_deploy.tree.tree import along, polyline_arc
+
 STEP_MM = 0.8
 #: exponent of Murray's law: r_parent^3 = sum r_daughter^3
 MURRAY = 3.0
@@ -155,11 +157,8 @@ def texture_radius(
 
 
 def _resample(points: np.ndarray) -> np.ndarray:
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
-    n = max(4, int(arc[-1] / STEP_MM) + 1)
-    t = np.linspace(0, arc[-1], n)
-    return np.stack([np.interp(t, arc, points[:, k]) for k in range(3)], axis=1)
+    arc = polyline_arc(points)
+    return along(points, arc, np.linspace(0, arc[-1], max(4, int(arc[-1] / STEP_MM) + 1)))
 
 
 def random_warp(rng: np.random.Generator) -> Warp:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
-from gcar_deploy.measure.lumen import reference_stretch
+from gcar_deploy.measure.lumen import branch_lumen
 from gcar_deploy.tree.tree import Tree
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
@@ -180,10 +180,9 @@ def _lesion(case: StenosisCase, tree: Tree) -> tuple[float | None, float | None]
         if least is not None and diameter[k] >= least:
             continue
         least, percent = float(diameter[k]), None
-        at, reference = reference_stretch(branch)
-        where = np.flatnonzero(at == k)
-        if len(where):
-            percent = 100 * (1 - least / float(reference[where[0]]))
+        healthy = float(branch_lumen(branch).healthy_mm[k])
+        if np.isfinite(healthy):
+            percent = 100 * (1 - least / healthy)
     return least, percent
 
 

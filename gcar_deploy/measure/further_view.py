@@ -10,7 +10,7 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.observability import curve_information, worst_across
-from gcar_deploy.measure.lumen import foreshortening
+from gcar_deploy.measure.lumen import hidden_share
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 
@@ -83,13 +83,11 @@ def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
             best, least = carm, sigma
     if best is None:
         return None
-    lengths = [branch.length_mm for branch in tree.branches]
-    hidden = [foreshortening(branch, best) for branch in tree.branches]
     return FurtherView(
         primary_angle_deg=best.primary_angle_deg,
         secondary_angle_deg=best.secondary_angle_deg,
         name=best.clinical_name(),
         sigma_before_mm=mean_sigma(np.asarray(known)),
         sigma_after_mm=least,
-        foreshortening=float(np.average(hidden, weights=np.maximum(lengths, 1e-9))),
+        foreshortening=hidden_share(tree, best) or 0.0,
     )

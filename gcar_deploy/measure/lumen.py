@@ -9,7 +9,7 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Array, Scalars
+from gcar_deploy.types import Scalars
 
 #: a stretch this much narrower than its reference (share) counts as lesion.
 LESION_SHARE = 0.25
@@ -30,7 +30,6 @@ class BranchLumen:
     Attributes
     ----------
     healthy_mm : (m,) reference diameter at each point; NaN near the ends and in short branches
-    length_mm, mean_diameter_mm : float
     minimal_diameter_mm, minimal_at_mm : minimal lumen diameter and how far from the inlet
     reference_diameter_mm : healthy diameter there, by a line through the wider parts
     stenosis_percent : 100 (1 - minimal / reference), 0 or more
@@ -38,8 +37,6 @@ class BranchLumen:
     """
 
     healthy_mm: Scalars
-    length_mm: float
-    mean_diameter_mm: float
     minimal_diameter_mm: float | None = None
     minimal_at_mm: float | None = None
     reference_diameter_mm: float | None = None
@@ -59,58 +56,32 @@ class BifurcationAngle:
 
 def branch_lumen(branch: Branch) -> BranchLumen:
     """Measure one branch; see ``BranchLumen``."""
-    arc, diameter = diameter_curve(branch)
-    weight = np.gradient(arc) if len(arc) > 1 else np.ones(len(arc))
-    mean = float(np.average(diameter, weights=np.maximum(weight, 1e-9)))
+    arc, diameter = branch.arc_mm, 2.0 * branch.radius_mm
     healthy = np.full(len(arc), np.nan)
-    short = BranchLumen(healthy_mm=healthy, length_mm=float(arc[-1]), mean_diameter_mm=mean)
-    at, reference = reference_stretch(branch)
-    if not len(at):
-        return short
-    healthy[at] = reference
+    low, high = END_RADII * branch.radius_mm[0], END_RADII * branch.radius_mm[-1]
+    clear = (arc >= low) & (arc <= arc[-1] - high)
+    if np.count_nonzero(clear) < MIN_POINTS:
+        return BranchLumen(healthy_mm=healthy)
+    healthy[clear] = reference_curve(arc[clear], diameter[clear])
+    share = diameter / healthy
     # The most severe narrowing, not the narrowest point, which may just be the thin far end.
-    k = int(np.argmin(diameter[at] / reference))
-    narrow = diameter[at] < (1 - LESION_SHARE) * reference
-    lesion = 0.0
+    k = int(np.nanargmin(share))
+    # One more False, which is the neighbour of both ends.
+    narrow = np.append(share < 1 - LESION_SHARE, False)
+    first, last = k, k
     if narrow[k]:
-        first, last = k, k
-        while first > 0 and narrow[first - 1]:
+        while narrow[first - 1]:
             first -= 1
-        while last < len(narrow) - 1 and narrow[last + 1]:
+        while narrow[last + 1]:
             last += 1
-        lesion = float(arc[at[last]] - arc[at[first]])
-    minimal = float(diameter[at[k]])
-    return dataclasses.replace(
-        short,
-        minimal_diameter_mm=minimal,
-        minimal_at_mm=float(arc[at[k]]),
-        reference_diameter_mm=float(reference[k]),
-        stenosis_percent=max(0.0, 100.0 * (1.0 - minimal / float(reference[k]))),
-        lesion_length_mm=lesion,
+    return BranchLumen(
+        healthy_mm=healthy,
+        minimal_diameter_mm=float(diameter[k]),
+        minimal_at_mm=float(arc[k]),
+        reference_diameter_mm=float(healthy[k]),
+        stenosis_percent=max(0.0, 100.0 * (1.0 - float(share[k]))),
+        lesion_length_mm=float(arc[last] - arc[first]),
     )
-
-
-def reference_stretch(branch: Branch) -> tuple[Array, Scalars]:
-    """Points of a branch that are clear of its ends, and the healthy diameter there.
-
-    Returns
-    -------
-    at : (m,) int, points; none where the branch is too short to say
-    reference_mm : (m,)
-    """
-    arc, diameter = diameter_curve(branch)
-    clear = (arc >= END_RADII * branch.radius_mm[0]) & (
-        arc <= arc[-1] - END_RADII * branch.radius_mm[-1]
-    )
-    at = np.flatnonzero(clear)
-    if len(at) < MIN_POINTS:
-        return at[:0], diameter[:0]
-    return at, reference_curve(arc[at], diameter[at])
-
-
-def diameter_curve(branch: Branch) -> tuple[Scalars, Scalars]:
-    """(m,) distance along the branch and (m,) diameter, mm."""
-    return branch.arc_mm, 2.0 * branch.radius_mm
 
 
 def reference_curve(arc_mm: Scalars, diameter_mm: Scalars) -> Scalars:
@@ -151,6 +122,14 @@ def bifurcation_angles(tree: Tree) -> tuple[BifurcationAngle, ...]:
             angle = float(np.degrees(np.arccos(cosine)))
             out.append(BifurcationAngle(node=node, first=i, second=j, angle_deg=angle))
     return tuple(out)
+
+
+def hidden_share(tree: Tree, carm: CArm) -> float | None:
+    """Share of the whole tree's length that a view hides; None without a tree."""
+    total = tree.length_mm
+    if not total > 0:
+        return None
+    return sum(foreshortening(b, carm) * b.length_mm for b in tree.branches) / total
 
 
 def foreshortening(branch: Branch, carm: CArm) -> float:

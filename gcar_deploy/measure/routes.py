@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Tree, along, polyline_arc
 from gcar_deploy.types import Array, Points, Scalars
 
 #: radius of a free end is taken over so much of its branch, mm
@@ -43,8 +43,7 @@ class Route:
 
     def at(self, arc_mm: Array) -> Points:
         """(k, 3) places at distances from the ostium, which are held to the way's own."""
-        columns = [np.interp(arc_mm, self.arc_mm, self.points_mm[:, k]) for k in range(3)]
-        return np.stack(columns, axis=-1)
+        return along(self.points_mm, self.arc_mm, arc_mm)
 
     def until(self, count: int) -> Route:
         """Return the way over its first ``count`` branches."""
@@ -108,12 +107,11 @@ def _route(tree: Tree, way: tuple[int, ...], nodes: tuple[int, ...]) -> Route:
         radius.append(branch.radius_mm[::turn])
         arcs.append(arcs[-1] + branch.length_mm)
     line = np.concatenate(points)
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     return Route(
         branches=way,
         nodes=nodes,
         points_mm=line,
         radius_mm=np.concatenate(radius),
-        arc_mm=np.concatenate([[0.0], np.cumsum(steps)]),
+        arc_mm=polyline_arc(line),
         node_arc_mm=tuple(arcs),
     )

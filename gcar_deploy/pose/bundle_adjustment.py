@@ -23,7 +23,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import ray_gaps
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.joint import corrected
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Tree, along
 from gcar_deploy.types import Array, Points, Scalars
 
 #: step of a correction for its derivative, degrees or mm
@@ -110,7 +110,7 @@ def _sampled(tree: Tree, spacing_mm: float) -> Points:
     for branch in tree.branches:
         count = max(2, round(branch.length_mm / spacing_mm))
         at = np.linspace(0, branch.length_mm, count + 1)
-        parts.append(np.column_stack([np.interp(at, branch.arc_mm, c) for c in branch.points_mm.T]))
+        parts.append(along(branch.points_mm, branch.arc_mm, at))
     return np.concatenate(parts) if parts else np.zeros((0, 3))
 
 

@@ -13,7 +13,7 @@ from gcar_deploy.errors import GeometryError, RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import match_rate
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.measure.lumen import foreshortening
+from gcar_deploy.measure.lumen import hidden_share
 from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
 from gcar_deploy.quality.gates import best_separation, disagreement_limits
@@ -252,16 +252,8 @@ def view_quality(
         overlap=2.0 * int((lumen & view.mask).sum()) / total if total else None,
         coverage_2px=strict,
         match_rate=None if partner is None else _match_rate(view, partner),
-        foreshortening=_hidden(tree, view.carm),
+        foreshortening=hidden_share(tree, view.carm),
     )
-
-
-def _hidden(tree: Tree, carm: CArm) -> float | None:
-    """Share of the whole tree's length that a view hides; None without a tree."""
-    total = tree.length_mm
-    if not total > 0:
-        return None
-    return sum(foreshortening(b, carm) * b.length_mm for b in tree.branches) / total
 
 
 def _match_rate(view: VesselImage, partner: VesselImage) -> float | None:

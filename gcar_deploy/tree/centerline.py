@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TreeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.tree.curves import draw_branches
+from gcar_deploy.tree.curves import LEAST_CONFIDENCE, draw_branches
 from gcar_deploy.tree.raster import blurred, depth_of, hysteresis, peaks, splat, touching
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Points, Scalars
@@ -35,8 +35,6 @@ MAX_REACH_MM = 200.0
 MAX_CELLS = 40_000_000
 #: a larger given radius is no coronary vessel's, mm.
 MAX_GIVEN_RADIUS_MM = 6.0
-#: points with less confidence than this do not change what is above a threshold
-LEAST_CONFIDENCE = 1e-6
 #: empty cells round the raster.
 PAD = 4
 

@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TreeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.tree.tree import Branch, Tree, empty_tree
+from gcar_deploy.tree.tree import Branch, Tree, along, empty_tree, polyline_arc
 from gcar_deploy.types import Array, Points, Scalars
 
-#: points with less confidence than this move no centroid.
+#: points with less confidence than this move no centroid and change no threshold's outcome
 LEAST_CONFIDENCE = 1e-6
 
 
@@ -57,11 +57,9 @@ def draw_branches(
 
 def resample(points_mm: Points, step_mm: float) -> Points:
     """(m, 3) points about ``step_mm`` apart along a polyline, both ends kept, m >= 2."""
-    length = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(length)])
+    arc = polyline_arc(points_mm)
     count = max(int(np.rint(arc[-1] / step_mm)), 1) + 1
-    at = np.linspace(0.0, arc[-1], count)
-    return np.stack([np.interp(at, arc, points_mm[:, k]) for k in range(3)], axis=1)
+    return along(points_mm, arc, np.linspace(0.0, arc[-1], count))
 
 
 def smooth_line(points_mm: Points, weight: Scalars, sigma_steps: float) -> Points:

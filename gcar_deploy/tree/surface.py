@@ -73,12 +73,6 @@ def stl_bytes(surface: Surface, title: str = "lumen, mm, LPS") -> bytes:
     return header + struct.pack("<I", len(corners)) + record.tobytes()
 
 
-def volume_mm3(surface: Surface) -> float:
-    """Enclosed volume, positive when the normals point outwards."""
-    a, b, c = (surface.vertices_mm[surface.faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
-
-
 def _lattice(tree: Tree, edge_mm: float | None) -> Grid:
     radii = tree.radii()
     edge = edge_mm or float(np.clip(EDGE_PER_RADIUS * radii.min(), *EDGE_BOUNDS_MM))

@@ -36,8 +36,7 @@ class Branch:
     @property
     def arc_mm(self) -> Scalars:
         """(m,) distance from the first point along the centreline, mm."""
-        steps = np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return polyline_arc(self.points_mm)
 
     @property
     def length_mm(self) -> float:
@@ -127,6 +126,28 @@ class Tree:
 def empty_tree() -> Tree:
     """Return a tree without a branch."""
     return Tree(nodes_mm=np.zeros((0, 3)), branches=())
+
+
+def polyline_arc(points_mm: Points) -> Scalars:
+    """(m,) distance of each point of a polyline from the first one along it, mm."""
+    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def along(points_mm: Points, arc_mm: Scalars, at_mm: Array) -> Points:
+    """Places on a polyline by linear interpolation.
+
+    Parameters
+    ----------
+    points_mm : (m, 3)
+    arc_mm : (m,) ascending distance of each
+    at_mm : (...) distances asked for; those beyond the ends are held to them
+
+    Returns
+    -------
+    (..., 3)
+    """
+    return np.stack([np.interp(at_mm, arc_mm, column) for column in points_mm.T], axis=-1)
 
 
 def polyline_tangents(points_mm: Points) -> Points:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.tree.tree import Branch, Tree, polyline_tangents
+from gcar_deploy.tree.tree import Branch, Tree, along
 from gcar_deploy.types import Array, Points, Scalars
 
 #: distance between neighbours over their standard deviation along the vessel.
@@ -64,9 +64,8 @@ def _branch(branch: Branch) -> tuple[Array, ...]:
     count = max(int(np.ceil(steps[-1])), 1)
     edges = np.interp(np.linspace(0, steps[-1], count + 1), steps, arc)
     at = 0.5 * (edges[1:] + edges[:-1])
-    means = np.stack([np.interp(at, arc, branch.points_mm[:, k]) for k in range(3)], axis=1)
-    tangents = polyline_tangents(branch.points_mm)
-    tangents = np.stack([np.interp(at, arc, tangents[:, k]) for k in range(3)], axis=1)
+    means = along(branch.points_mm, arc, at)
+    tangents = along(branch.tangents, arc, at)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
     stretch = np.diff(edges)
     return (

@@ -13,9 +13,9 @@ import pytest
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output.bundle import SURFACE_EDGE_MM, render_files
 from gcar_deploy.output.glb import glb_bytes
-from gcar_deploy.tree.surface import lumen_surface, stl_bytes, volume_mm3
+from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 from gcar_deploy.tree.tree import empty_tree
-from tests.tree.shapes import fork, tube
+from tests.tree.shapes import enclosed_mm3, fork, tube
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_glb_is_the_surface_in_metres_with_the_head_up():
     scene = trimesh.load_scene(io.BytesIO(glb_bytes(surface)), file_type="glb")
     mesh = scene.to_mesh()
     assert mesh.is_watertight and len(mesh.faces) == len(surface.faces)
-    assert mesh.volume == pytest.approx(volume_mm3(surface) * 1e-9, rel=1e-4)
+    assert mesh.volume == pytest.approx(enclosed_mm3(surface) * 1e-9, rel=1e-4)
     np.testing.assert_allclose(mesh.extents, [0.004, 0.034, 0.004], atol=2e-4)
     # A point 10 mm to the left, 20 mm behind, 30 mm towards the head.
     matrix = next(iter(scene.graph.transforms.edge_data.values()))["matrix"]

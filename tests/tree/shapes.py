@@ -63,6 +63,12 @@ def points_of(tree, where, noise=0.0, seed=0):
     )
 
 
+def enclosed_mm3(surface):
+    """Volume inside a closed surface, positive when the normals point outwards."""
+    a, b, c = (surface.vertices_mm[surface.faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
 def dice(a, b):
     a, b = a >= 0.5, b >= 0.5
     return 2 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b))

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from gcar_deploy.tree.surface import lumen_surface, stl_bytes, volume_mm3
+from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 from gcar_deploy.tree.tree import empty_tree
-from tests.tree.shapes import fork, tube
+from tests.tree.shapes import enclosed_mm3, fork, tube
 
 
 def edge_counts(faces):
@@ -15,13 +15,13 @@ def edge_counts(faces):
 def test_watertight_and_outwards(tree):
     surface = lumen_surface(tree)
     assert (edge_counts(surface.faces) == 2).all()
-    assert volume_mm3(surface) > 0
+    assert enclosed_mm3(surface) > 0
     assert np.isfinite(surface.vertices_mm).all()
 
 
 def test_volume_and_place_of_a_tube():
     surface = lumen_surface(tube(length=30, radius=2), edge_mm=0.3)
-    assert volume_mm3(surface) == pytest.approx(np.pi * 4 * 30 + 4 / 3 * np.pi * 8, rel=0.02)
+    assert enclosed_mm3(surface) == pytest.approx(np.pi * 4 * 30 + 4 / 3 * np.pi * 8, rel=0.02)
     middle = np.abs(surface.vertices_mm[:, 2]) < 14
     r = np.linalg.norm(surface.vertices_mm[middle, :2], axis=1)
     np.testing.assert_allclose(r, 2.0, atol=0.03)
