@@ -17,7 +17,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.vessels import find_vessels
-from gcar_deploy.measure.inlet import from_inlets
+from gcar_deploy.measure import from_inlets
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import check_candidates, check_tree, check_views, judge

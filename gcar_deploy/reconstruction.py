@@ -19,9 +19,9 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import EXACT_DISAGREEMENT, silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.measure import BranchName, Measured, measured
 from gcar_deploy.measure.lumen import BranchLumen
-from gcar_deploy.measure.measured import Measured, measured
-from gcar_deploy.measure.naming import LEAST_CONFIDENCE, BranchName
+from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
 from gcar_deploy.quality import Quality, unexplained
 from gcar_deploy.tree.tree import Branch, Tree

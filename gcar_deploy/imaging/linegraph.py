@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import heapq
+import functools
+import math
 from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from gcar_deploy.types import Mask
 
@@ -54,19 +57,28 @@ class LineGraph:
 
     def distances(self, start: Pixel, limit: float, barred: Iterable[Pixel]) -> dict[Pixel, float]:
         """Distance along the line in pixels, up to ``limit``, without stepping on ``barred``."""
-        closed = set(barred)
-        found = {start: 0.0}
-        queue = [(0.0, start)]
-        while queue:
-            so_far, pixel = heapq.heappop(queue)
-            if so_far > found[pixel]:
-                continue
-            for near in self.joined(pixel):
-                length = so_far + _step(pixel, near)
-                if near not in closed and length <= limit and length < found.get(near, np.inf):
-                    found[near] = length
-                    heapq.heappush(queue, (length, near))
-        return found
+        number, links = self._links
+        closed = np.zeros(len(number), bool)
+        closed[[number[pixel] for pixel in barred]] = True
+        open_ = ~(closed[links.row] | closed[links.col])
+        ways = sparse.csr_matrix(
+            (links.data[open_], (links.row[open_], links.col[open_])), shape=links.shape
+        )
+        length = csgraph.dijkstra(ways, indices=number[start], limit=limit)
+        return {pixel: float(length[k]) for pixel, k in number.items() if np.isfinite(length[k])}
+
+    @functools.cached_property
+    def _links(self) -> tuple[dict[Pixel, int], sparse.coo_matrix]:
+        """Number of each pixel, and the length of each step."""
+        number = {pixel: k for k, pixel in enumerate(sorted(self._pixels))}
+        steps = [
+            (k, number[near], math.dist(pixel, near))
+            for pixel, k in number.items()
+            for near in self.joined(pixel)
+        ]
+        rows, columns, lengths = zip(*steps, strict=True) if steps else ((), (), ())
+        size = (len(number), len(number))
+        return number, sparse.coo_matrix((lengths, (rows, columns)), shape=size)
 
     def shortest(self, distances: Mapping[Pixel, float], last: Pixel) -> list[Pixel]:
         """Way along the line from the start of ``distances`` to ``last``."""
@@ -124,7 +136,3 @@ class LineGraph:
                 new.extend(near)
             stretches.append(sorted(stretch))
         return stretches
-
-
-def _step(one: Pixel, other: Pixel) -> float:
-    return 1.0 if one[0] == other[0] or one[1] == other[1] else 2**0.5

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.measure.measured import Measured
+from gcar_deploy.measure import Measured
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 
