@@ -77,7 +77,8 @@ def test_csv_numbers_arcs_and_unknown_sigma(result):
 
 
 def test_table_and_json_state_the_trees_own_numbers(result):
-    rows = list(csv.DictReader(io.StringIO(centerline_csv(result.tree).decode("ascii"))))
+    written = centerline_csv(result.tree, result.measured).decode("ascii")
+    rows = list(csv.DictReader(io.StringIO(written)))
     own = {
         "radius_mm": result.tree.radii(),
         "sigma_mm": np.concatenate([b.sigma_mm for b in result.tree.branches]),
