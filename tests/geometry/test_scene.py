@@ -148,9 +148,15 @@ def test_bad_json(text, message):
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(GeometryError, match=r"none\.json cannot be read"):
         load_scene(tmp_path / "none.json")
-    (tmp_path / "utf16.json").write_text(json.dumps(SCENE), encoding="utf-16")
+    (tmp_path / "latin1.json").write_text(json.dumps(SCENE) + "\xe4", encoding="latin-1")
     with pytest.raises(GeometryError, match="UTF-8"):
-        load_scene(tmp_path / "utf16.json")
+        load_scene(tmp_path / "latin1.json")
+    (tmp_path / "cut.json").write_bytes(json.dumps(SCENE).encode("utf-16")[:-1])
+    with pytest.raises(GeometryError, match="UTF-16"):
+        load_scene(tmp_path / "cut.json")
+    for encoding in ("utf-16", "utf-8-sig"):
+        (tmp_path / "marked.json").write_text(json.dumps(SCENE), encoding=encoding)
+        assert load_scene(tmp_path / "marked.json") == parse_scene(json.dumps(SCENE))
 
 
 def test_round_trip_and_defaults():
