@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ SEGMENTERS = ("auto", "classic", "net")
 PREDICTORS = ("auto", "multi", "single", "none")
 REFINERS = ("tube", "paper", "none")
 EXTRAS = ("glb", "dicom-stl")
+_NUMBER = re.compile(r"0|[1-9][0-9]?", re.ASCII)
 _CHOICES = {
     "pose": POSES, "segmenter": SEGMENTERS, "predictor": PREDICTORS, "refiner": REFINERS,
 }  # fmt: skip
@@ -239,7 +241,7 @@ def _geometry(key: str, value: Any) -> Any:
 
 
 def _masks(key: str, value: Any) -> dict[int, Path]:
-    if not isinstance(value, dict) or not all(k.isdecimal() and len(k) < 3 for k in value):
+    if not isinstance(value, dict) or not all(_NUMBER.fullmatch(k) for k in value):
         raise UsageError(f"{key} = {quote(value)} must be an object: number of the view -> file")
     return {int(k): _path(f"{key}.{k}", name) for k, name in value.items()}
 

@@ -101,6 +101,8 @@ BASE = {"views": ["a", "b"]}
         ({"geometry": 3}, "geometry must be"),
         ({"masks": ["m"]}, "number of the view"),
         ({"masks": {"one": "m"}}, "number of the view"),
+        ({"masks": {"1": "m", "01": "n"}}, "number of the view"),
+        ({"masks": {"\u0661": "m"}}, "number of the view"),
         ({"masks": {"3": "m"}}, "mask 3: there are views 1 .. 2"),
         ({"masks": {"0": "m"}}, "mask 0"),
         ({"masks": {"1": 4}}, "masks.1 = 4"),

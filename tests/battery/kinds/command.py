@@ -31,6 +31,8 @@ _GCAR = (
     ["validate", "V", "W", "--geom", "G", "--json"],
     ["enhance", "V", "--out", "O", "--kind", "raw", "--polarity", "auto"],
     ["enhance", "V", "--out", "O", "--kind", "path_length", "--mm-per-count", "0.001"],
+    [*_RUN, "--mask", "2:W", "--landmark", "9,9:9,9", "--print-order"],
+    ["run", "--order", "G", "--out", "O"],
     ["info", "R", "--json"],
     ["doctor", "--help"],
     ["demo", "--out", "O", "--help"],
@@ -49,7 +51,8 @@ _EXPORT = (
 _WORDS = (
     "", "-", "--", "--help", "-v", "--json", "--force", "--fast", "nan", "-1", "0", "1e999", "inf",
     "9" * 400, "\u202e", "a" * 5000, ".", "/", "/dev/null", "/dev/full", "V", "O", "D", "G",
-    "P", "--out", "--geom", "--threads", "--model", "--deadline", "--predictor", "tube", "none",
+    "P", "--out", "--geom", "--order", "--mask", "1:P", "--print-order", "--frame",
+    "--landmark", "--threads", "--model", "--deadline", "--predictor", "tube", "none",
     "\udcff",
 )  # fmt: skip
 

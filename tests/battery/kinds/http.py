@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.inputs.order import KEYS
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.http import create_app
 from gcar_deploy.worker.jobs import JobQueue
@@ -67,7 +68,7 @@ def make(seed: int) -> Case:
 
 def _work(order: Any, on_progress: Any, cancel: Any) -> Any:
     """Read what the order names, so that a wrong path shows; reconstruct nothing."""
-    for path in order.views:
+    for path in order.files.values():
         if SECRET in Path(path).read_bytes():
             raise UsageError(SECRET.decode())
     raise UsageError("read")
@@ -117,10 +118,21 @@ def _judged(answer: Any, folder: Path, allowed: bool, path: str) -> str:
 def _order(rng: random.Random) -> dict[str, Any]:
     names = [rng.choice(_NAMES) if rng.random() < 0.5 else "view1.png" for _ in range(2)]
     order: dict[str, Any] = {"views": names, "geometry": rng.choice(("geom.json", *_NAMES[:8]))}
-    for key in ("out", "force", "strict", "deadline_s"):
-        if rng.random() < 0.2:
+    if rng.random() < 0.5:
+        order["masks"] = {rng.choice(("1", "2", "3", "01", "\u0661", "")): rng.choice(_NAMES)}
+    for key in KEYS:
+        if key not in order and rng.random() < 0.1:
             order[key] = rng.choice((*_NAMES, *EDGES)) if key == "out" else rng.choice(EDGES)
     return {k: v for k, v in order.items() if not isinstance(v, int) or abs(v) < 2**70}
+
+
+def _told(rng: random.Random) -> dict[str, Any]:
+    """Options of an order, right as they stand."""
+    known = {
+        "strict": True, "frames": [1, None], "pixel_spacing_mm": 0.3, "pose": "off",
+        "segmenter": "classic", "extras": ["glb"], "deadline_s": 5,
+    }  # fmt: skip
+    return {key: value for key, value in known.items() if rng.random() < 0.5}
 
 
 def _multipart(views: list[bytes], scene: Any, rng: random.Random) -> tuple[bytes, str]:
@@ -128,9 +140,13 @@ def _multipart(views: list[bytes], scene: Any, rng: random.Random) -> tuple[byte
     parts = [("view", "a.png", view) for view in views]
     parts.append(("geometry", None, json.dumps(changed(scene, rng)).encode("utf-8", "replace")))
     if rng.random() < 0.3:
-        parts.append(("options", None, json.dumps(changed({"strict": True}, rng)).encode()))
+        parts.append(("options", None, json.dumps(changed(_told(rng), rng)).encode()))
     if rng.random() < 0.3:
         parts[rng.randrange(len(parts))] = ("view", rng.choice(_NAMES), b"x" * rng.choice((0, 9)))
+    if rng.random() < 0.3:
+        parts.append(
+            (rng.choice(("mask1", "mask9", "mask0", "mask")), rng.choice(_NAMES), views[0])
+        )
     if rng.random() < 0.05:
         parts.append(("view", "b.png", bytes(2 * 2**20)))
     out = b""
