@@ -19,18 +19,32 @@ if TYPE_CHECKING:
     from gcar_deploy.geometry.carm import CArm
     from gcar_deploy.geometry.grid import Grid
     from gcar_deploy.geometry.scene import Scene, load_scene
+    from gcar_deploy.inputs.order import Order, load_order
     from gcar_deploy.result import Result
 
-__all__ = ["CArm", "Engine", "GcarError", "Grid", "Result", "RunOptions", "Scene", "load_scene"]
+__all__ = [
+    "CArm",
+    "Engine",
+    "GcarError",
+    "Grid",
+    "Order",
+    "Result",
+    "RunOptions",
+    "Scene",
+    "load_order",
+    "load_scene",
+]
 
 _HOMES = {
     "CArm": "gcar_deploy.geometry.carm",
     "Engine": "gcar_deploy.engine",
     "GcarError": "gcar_deploy.errors",
     "Grid": "gcar_deploy.geometry.grid",
+    "Order": "gcar_deploy.inputs.order",
     "Result": "gcar_deploy.result",
     "RunOptions": "gcar_deploy.config",
     "Scene": "gcar_deploy.geometry.scene",
+    "load_order": "gcar_deploy.inputs.order",
     "load_scene": "gcar_deploy.geometry.scene",
 }
 

@@ -87,6 +87,18 @@ def test_what_an_order_leaves_open_is_as_the_engine_was_set_up():
     assert Order(views=(Path("a"), Path("b"))).options(base) == base
 
 
+def test_its_choices_are_those_of_the_code():
+    from gcar_deploy.imaging import net
+    from gcar_deploy.output.bundle import EXTRAS as FILES
+    from gcar_deploy.predict import center_predictor
+    from gcar_deploy.tubes.refine import REFINERS as FITS
+
+    assert set(SEGMENTERS) == set(net.CHOICES)
+    assert set(PREDICTORS) == set(center_predictor.CHOICES)
+    assert set(REFINERS) == set(FITS)
+    assert set(EXTRAS) == set(FILES)
+
+
 BASE = {"views": ["a", "b"]}
 
 
