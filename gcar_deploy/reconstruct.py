@@ -135,7 +135,7 @@ def _reconstructed(
     with watch.stage("pose"):
         placed = register(angiograms, vessels.views, options, tree_of).or_refuse()
     with watch.stage("candidates"), placed.hinting():
-        seen = seen_by_all(placed.views, grid, options)
+        seen = seen_by_all(placed.views, grid, options, predictor)
         check_candidates(len(seen.hull), seen.hull.lattice, options.quality)
     with watch.stage("centers"):
         centers = find_centers(seen, predictor, options, watch)

@@ -75,8 +75,10 @@ class PredictOptions:
     #: after the first only what lies near points of at least this confidence is asked again
     looks: Annotated[int, Range(1, 4)] = 2
     look_again: Share = 0.15
-    #: edge of the lattice the predictor works on: the grid's own within these bounds, mm
+    #: edge of the lattice the predictor works on: the grid's own within these bounds, mm; thin
+    #: vessels get finer cells down to ``thin_cell_mm`` where the predictor knows such cells
     min_cell_mm: Annotated[float, Range(0.3, 10)] = 0.85
     max_cell_mm: Annotated[float, Range(0.3, 10)] = 1.5
+    thin_cell_mm: Annotated[float, Range(0.2, 10)] = 0.3
     limits: ModelLimits = dataclasses.field(default_factory=ModelLimits)
     single: SingleViewOptions = dataclasses.field(default_factory=SingleViewOptions)

@@ -5,19 +5,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import numpy as np
-
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import CandidateOptions, RunOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import sampled_path
-from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
+from gcar_deploy.predict.center_predictor import CenterPredictor, Predictor, SingleViewPredictor
 from gcar_deploy.predict.decision import decide
 from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_deploy.predict.hull import Candidates, cubic_lattice, visual_hull
 from gcar_deploy.predict.lattices import mean_evidence, near_evidence, shifted_lattice
+from gcar_deploy.predict.resolution import Resolution, resolution
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.stopwatch import Stopwatch
@@ -38,12 +37,14 @@ class Seen:
     sampled : per view C-arm, path_mm as finely as the lattice, and whether paths are true mm
     hull : n lattice points, possibly none
     encoded : what each view shows at and around them
+    candidates : what makes a point one of the hull
     """
 
     views: tuple[VesselImage, ...]
     sampled: tuple[tuple[CArm, Image, bool], ...]
     hull: Candidates
     encoded: Encoded
+    candidates: CandidateOptions
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,19 +79,25 @@ class Centers:
     findings: tuple[str, ...] = ()
 
 
-def seen_by_all(views: Sequence[VesselImage], grid: Grid, options: RunOptions) -> Seen:
-    """Find the points of a lattice over ``grid`` that all views see as vessel."""
-    lattice = cubic_lattice(grid, cell_mm(grid, options))
-    paths = [sampled_path(view, float(lattice.spacing_mm[0])) for view in views]
-    hull = visual_hull(paths, lattice, options.candidates)
+def seen_by_all(
+    views: Sequence[VesselImage],
+    grid: Grid,
+    options: RunOptions,
+    predictor: Predictor | None = None,
+) -> Seen:
+    """Find the points of a lattice over ``grid`` that all views see as vessel.
+
+    The lattice is as fine as the vessels want it and the predictor knows it (``resolution``).
+    """
+    spec = predictor.model.spec if isinstance(predictor, CenterPredictor) else None
+    wanted: Resolution | None = resolution(views, grid, options, spec)
+    while wanted is not None:
+        chosen = dataclasses.replace(options.candidates, min_path_cells=wanted.min_path_cells)
+        paths = [sampled_path(view, wanted.cell_mm) for view in views]
+        hull = visual_hull(paths, cubic_lattice(grid, wanted.cell_mm), chosen)
+        wanted = wanted.coarser(len(hull))
     sampled = tuple((*p, view.calibrated) for p, view in zip(paths, views, strict=True))
-    return Seen(tuple(views), sampled, hull, encode(hull, sampled))
-
-
-def cell_mm(grid: Grid, options: RunOptions) -> float:
-    """Return the edge of the lattice: the grid's own where the predictor knows such cells."""
-    own = float(np.mean(grid.spacing_mm))
-    return float(np.clip(own, options.predict.min_cell_mm, options.predict.max_cell_mm))
+    return Seen(tuple(views), sampled, hull, encode(hull, sampled), chosen)
 
 
 def find_centers(
@@ -125,7 +132,7 @@ def find_centers(
         lattice = shifted_lattice(seen.hull.lattice, look)
         near = near_evidence(seen.hull, told.confidence, look, options.predict.look_again)
         paths = [(carm, path) for carm, path, _ in seen.sampled]
-        other = visual_hull(paths, lattice, options.candidates, near)
+        other = visual_hull(paths, lattice, seen.candidates, near)
         if len(other):
             others.append((other, predictor.predict(other, encode(other, seen.sampled), stop)))
     told = mean_evidence(told, others)
@@ -142,7 +149,7 @@ def quick_tree(
     watch: Stopwatch,
 ) -> Tree:
     """Make a tree that is good enough to say where the views stand; possibly empty."""
-    seen = seen_by_all(views, grid, options)
+    seen = seen_by_all(views, grid, options, predictor)
     watch.check()
     if len(seen.hull) == 0:
         return empty_tree()

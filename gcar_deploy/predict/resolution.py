@@ -1,0 +1,109 @@
+"""How fine a lattice a scene wants: as fine as its thin vessels, as far as the predictor knows it.
+
+Cells as wide as the thin vessels show them; finer ones cost more and tell no more. Thick vessels,
+and predictors that were trained on coarse cells alone, keep the cells of the volume asked for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.types import Scalars
+
+#: a vessel is thin whose radius so large a share of the lines does not reach
+THIN_SHARE = 0.15
+#: cells are so many times the thin vessels' radius wide
+CELLS_PER_RADIUS = 2.0
+#: a point is kept from this share of the thin vessels' own path on
+PATH_SHARE = 0.5
+#: a hull with more points is laid on cells wider by ``COARSER``
+MOST_POINTS = 60_000
+COARSER = 1.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Resolution:
+    """Cells of a lattice, and what vessel is on it.
+
+    Attributes
+    ----------
+    cell_mm : edge of a cell
+    coarsest_mm : edge that it may grow to where the hull has too many points
+    min_path_cells : see ``CandidateOptions``
+    """
+
+    cell_mm: float
+    coarsest_mm: float
+    min_path_cells: float
+
+    def coarser(self, points: int) -> Resolution | None:
+        """Return the next coarser one where a hull has too many points; None where it may stay."""
+        if points <= MOST_POINTS or self.cell_mm >= self.coarsest_mm:
+            return None
+        cell = min(self.cell_mm * COARSER, self.coarsest_mm)
+        return dataclasses.replace(self, cell_mm=cell)
+
+
+def resolution(
+    views: Sequence[VesselImage], grid: Grid, options: RunOptions, spec: Mapping[str, Any] | None
+) -> Resolution:
+    """Choose the cells for a scene.
+
+    Parameters
+    ----------
+    views : V vessel images
+    grid : Grid that is asked for
+    options : RunOptions
+    spec : of the predictor; its ``spacing_mm`` (least, most) are the cells that it knows, its
+        ``path_cells`` the thresholds of the hull, by default the one of ``options`` alone
+    """
+    o, usual = options.predict, options.candidates.min_path_cells
+    own = float(np.clip(np.mean(grid.spacing_mm), o.min_cell_mm, o.max_cell_mm))
+    least = max(_least(spec, "spacing_mm", o.min_cell_mm), o.thin_cell_mm)
+    if least >= o.min_cell_mm:
+        return Resolution(own, own, usual)
+    thin = _thin_radius_mm(views)
+    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    cell = float(np.clip(CELLS_PER_RADIUS * thin, min(max(least, pixel), own), own))
+    path = PATH_SHARE * np.pi * (thin / cell) ** 2
+    low = min(_least(spec, "path_cells", usual), usual)
+    return Resolution(cell, own, float(np.clip(path, low, usual)))
+
+
+def _least(spec: Mapping[str, Any] | None, key: str, otherwise: float) -> float:
+    """Least of a (least, most) pair of the spec; the other value where it says none."""
+    pair = None if spec is None else spec.get(key)
+    if not isinstance(pair, (list, tuple)) or len(pair) != 2:
+        return otherwise
+    return float(pair[0])
+
+
+def _thin_radius_mm(views: Sequence[VesselImage]) -> float:
+    """Radius that ``THIN_SHARE`` of the pictures' lines does not reach, mm; infinite without any.
+
+    Counted in mm of line at the isocentre.
+    """
+    found: list[Scalars] = []
+    weight: list[Scalars] = []
+    for view in views:
+        pixel = view.carm.pixel_at_isocenter_mm
+        # To the centre of the first pixel outside, half a pixel too far; from that of one inside,
+        # which lies a quarter off the axis.
+        depth = cv2.distanceTransform(view.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.25
+        radius = depth[view.skeleton].astype(np.float64) * pixel
+        found.append(radius)
+        weight.append(np.full(len(radius), pixel))
+    radii, lengths = np.concatenate(found), np.concatenate(weight)
+    if not len(radii):
+        return np.inf
+    order = np.argsort(radii, kind="stable")
+    part = np.cumsum(lengths[order])
+    return float(radii[order][np.searchsorted(part, THIN_SHARE * part[-1])])
