@@ -48,13 +48,14 @@ class _Progress:
 
 
 @click.command()
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=_FOLDER, help="Folder with imagecas/, asoca/ or masks; not for thin.")
 @click.option(
     "--protocol",
-    type=click.Choice([*_SET_UPS, "common"]),
+    type=click.Choice([*_SET_UPS, "common", "thin"]),
     default="paper",
     show_default=True,
-    help="common: masks of one artery, as PPCAR-Net and its peers are compared.",
+    help="common: masks of one artery, as PPCAR-Net and its peers are compared; thin: generated "
+    "trees with thin branches.",
 )
 @click.option(
     "--methods",
@@ -86,7 +87,7 @@ class _Progress:
 @click.option("--draw-only", is_flag=True, help="Tables and pictures anew from --out/cases.csv.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def evaluate(
-    data: Path,
+    data: Path | None,
     protocol: str,
     methods: str,
     views: str,

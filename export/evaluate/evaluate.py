@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import json
 import logging
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from gcar_deploy.errors import UsageError
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
 from gcar_export.evaluate.jobs import Job, case_name, row_path, write_done
-from gcar_export.evaluate.protocols import GROUPS, PROTOCOLS
+from gcar_export.evaluate.protocols import COMMON, PROTOCOLS
+from gcar_export.evaluate.thin_protocol import THIN, thin_names
 from gcar_export.methods.settings import METHODS, MethodSettings
 from gcar_export.methods.solve import check_models
 
@@ -30,6 +31,8 @@ LABEL_PATTERNS = (
     "imagecas/*.label.nii.gz", "asoca/*.npz", "asoca/*.nrrd",
     "*.label.nii.gz", "*.nii.gz", "*.nrrd", "*.mha",
 )  # fmt: skip
+#: protocols that one word asks for
+GROUPS: Mapping[str, tuple[str, ...]] = {"common": tuple(COMMON), "thin": tuple(THIN)}
 #: what to do with rows that were made with other settings.
 CHANGED = ("redo", "keep", "refuse")
 OnProgress = Callable[[int, int, str], None]
@@ -42,7 +45,8 @@ class EvaluateOptions:
     Attributes
     ----------
     data : folder with label volumes (``imagecas/``, ``asoca/``, or the files themselves; a
-        folder that holds them in ``data/`` is taken as well)
+        folder that holds them in ``data/`` is taken as well); None for ``thin``, whose trees are
+        generated
     out : folder for rows, tables and pictures; may hold an interrupted evaluation
     protocol : one of ``PROTOCOLS`` or ``GROUPS``
     methods : names from ``METHODS``
@@ -57,7 +61,7 @@ class EvaluateOptions:
     settings : MethodSettings
     """
 
-    data: Path
+    data: Path | None
     out: Path
     protocol: str
     methods: tuple[str, ...]
@@ -132,9 +136,12 @@ def evaluate(
     ModelError
         A method's model is missing.
     """
-    labels = [p for p in find_labels(options.data) if _wanted(p, options.cases)]
+    generated = options.protocol == "thin"
+    known = thin_names() if generated else find_labels(_given(options.data))
+    labels = [p for p in known if _wanted(p, options.cases)]
     if not labels:
-        raise UsageError(f"none of the cases {', '.join(options.cases)} is in {options.data}")
+        where = f"{known[0].name} .. {known[-1].name}" if generated else options.data
+        raise UsageError(f"none of the cases {', '.join(options.cases)} is in {where}")
     check_models(options.methods, options.settings)
     digests = {method: options.settings.digest(method) for method in options.methods}
     jobs = [
@@ -232,6 +239,12 @@ def _write_settings(options: EvaluateOptions) -> None:
 def _read(path: Path) -> dict[str, Any]:
     row: dict[str, Any] = json.loads(path.read_text())
     return row
+
+
+def _given(data: Path | None) -> Path:
+    if data is None:
+        raise UsageError("--data is missing: a folder with label volumes")
+    return data
 
 
 def _wanted(label: Path, names: Sequence[str]) -> bool:

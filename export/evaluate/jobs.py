@@ -25,6 +25,7 @@ from gcar_deploy.measure.metrics import (
 )
 from gcar_deploy.types import Array, Volume
 from gcar_export.evaluate.protocols import COMMON, Case, make_case
+from gcar_export.evaluate.thin_protocol import THIN, line_measures, thin_case
 from gcar_export.methods.settings import MethodSettings
 from gcar_export.methods.solve import Solved, solve
 from gcar_export.scenes.labels import LabelVolume, read_label
@@ -123,16 +124,21 @@ def measure(case: Case, solved: Solved) -> dict[str, Measure]:
     New projections are cast from the returned volume, clipped to 0 .. 1, and averaged over
     the case's new views (those on which the measure is defined). Where the patient moved between
     the views, DSC is also given for the best common shift, which no two views can see. The common
-    protocol sums both directions of the Chamfer distance and counts connected components.
+    protocol sums both directions of the Chamfer distance and counts connected components; of trees
+    with a known centreline the shares found and true are told.
     """
     common = case.protocol in COMMON
-    found = volume_measures(case.truth, solved.volume, case.grid.spacing_mm, structure=not common)
+    found = volume_measures(
+        case.truth, solved.volume, case.grid.spacing_mm, structure=bool(case.new_views)
+    )
     if case.protocol == "moved":
         found["shifted_dsc"] = best_shifted_dice(case.truth, solved.volume)
     if common:
         both = found["chamfer_mm"]
         found["cd_mm"] = Measure(None if both.value is None else 2 * both.value, both.reason)
         found["parts"] = connected_parts(solved.volume)
+    if case.line_mm is not None:
+        found |= line_measures(case.line_mm, solved.line_mm)
     if not case.new_views:
         return found
     per_view = []
@@ -212,6 +218,8 @@ def _label(path: Path) -> LabelVolume:
 
 @functools.lru_cache(maxsize=1)
 def _case(path: Path, protocol: str, views: int) -> Case:
+    if protocol in THIN:
+        return thin_case(path.name, protocol, views)
     return make_case(_label(path), protocol, views)
 
 

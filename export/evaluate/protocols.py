@@ -14,6 +14,8 @@ common-lca left artery alone, its centroid in the isocentre, binary masks of 256
            0.65 mm, RAO25 CAU35 and LAO40 CRA20, SOD 750, SDD 900, voxels of 0.5 mm (PPCAR-Net,
            arXiv 2610.09383; ``common`` is this and the next)
 common-rca right artery alone, the same with 0.55 mm, RAO20 CRA20 and LAO60
+thin-...   generated left trees with thin branches on 960 pixels of 0.184 mm, noise of 0, 0.05 or
+           0.2 mm (``thin_protocol``; ``thin`` is all three)
 ========== ==================================================================================
 """
 
@@ -32,7 +34,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.types import Array, Volume
+from gcar_deploy.types import Array, Points, Volume
 from gcar_export.scenes.labels import LabelVolume
 from gcar_export.scenes.raw_pictures import raw_picture
 from gcar_export.scenes.raycast import raycast
@@ -43,8 +45,6 @@ COMMON: Mapping[str, tuple[int, float, tuple[tuple[float, float], ...]]] = {
     "common-rca": (1, 0.55, ((-20, 20), (60, 0))),
 }
 PROTOCOLS = ("paper", "clinical", "moved", "raw", *COMMON)
-#: what one word asks for
-GROUPS: Mapping[str, tuple[str, ...]] = {"common": tuple(COMMON)}
 #: a ray through half a voxel of the labels (0.5 mm) or more is vessel in a mask, mm
 MASK_PATH_MM = 0.25
 #: mm of vessel per count of a simulated 16-bit picture.
@@ -80,6 +80,8 @@ class Case:
         Area-averaged occupancy on ``scene.volume_grid()``.
     new_views : tuple of CArm
         Directions not used for fitting.
+    line_mm : (n, 3) or None
+        Points of the true centreline, where it is known exactly, mm LPS.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Case:
     label: LabelVolume
     truth: Volume
     new_views: tuple[CArm, ...]
+    line_mm: Points | None = None
 
     @property
     def grid(self) -> Grid:

@@ -34,6 +34,8 @@ MEASURES: Mapping[str, Column] = {
     "cldice": Column("clDice %"),
     "cd_mm": Column("CD (sum) mm", factor=1.0, better=-1),
     "parts": Column("components", factor=1.0, better=-1),
+    "found_1mm": Column("centreline found within 1 mm %"),
+    "true_1mm": Column("true lines within 1 mm of ours %"),
     "new_dsc": Column("new-proj. DSC %"),
     "new_psnr_db": Column("new-proj. PSNR dB", factor=1.0),
     "new_psnr_masked_db": Column("masked PSNR dB", factor=1.0),
@@ -45,7 +47,10 @@ COUNTS: Mapping[str, Column] = {
     "cpu_seconds": Column("CPU s", factor=1.0, better=-1),
 }
 #: measures that some protocols have, shown where one does
-SOME = ("shifted_dsc", "cd_mm", "parts", "new_dsc", "new_psnr_db", "new_psnr_masked_db", "ssim")
+SOME = (
+    "shifted_dsc", "cd_mm", "parts", "found_1mm", "true_1mm",
+    "new_dsc", "new_psnr_db", "new_psnr_masked_db", "ssim",
+)  # fmt: skip
 _NAMES = ("protocol", "dataset", "case", "method", "views", "status", "sentence")
 #: p below -> stars, as in the paper's figures.
 STARS = ((0.0001, "****"), (0.001, "***"), (0.01, "**"), (0.05, "*"))

@@ -18,8 +18,9 @@ from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import GcarError, ModelError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.types import Image, Volume
+from gcar_deploy.types import Image, Points, Volume
 from gcar_export.evaluate.protocols import Case
+from gcar_export.evaluate.thin_protocol import along
 from gcar_export.methods.settings import FBP_PAPER, METHODS, RUNTIME_ROWS, MethodSettings
 
 
@@ -35,6 +36,7 @@ class Solved:
     gaussians : number of Gaussians, None where the method has none
     status : ``ok``, ``degraded``, ``refused``, ``failed``
     sentence : why
+    line_mm : (n, 3) points along the tree's centreline, mm LPS; None where there is no tree
     """
 
     volume: Volume | None
@@ -42,6 +44,7 @@ class Solved:
     gaussians: int | None
     status: str
     sentence: str
+    line_mm: Points | None = None
 
 
 def solve(case: Case, method: str, settings: MethodSettings | None = None) -> Solved:
@@ -157,6 +160,9 @@ def _runtime(case: Case, options: RunOptions, *, swapped: bool) -> Solved:
         gaussians=int(result.counts["gaussians"]),
         status=result.quality.status,
         sentence=result.quality.sentence,
+        line_mm=None
+        if case.line_mm is None
+        else along([b.points_mm for b in result.tree.branches]),
     )
 
 

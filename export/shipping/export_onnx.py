@@ -24,7 +24,7 @@ from gcar_deploy.predict.encoding import (
 )
 from gcar_export.scenes.gantry import USUAL_SPREAD_DEG, USUAL_VIEWS
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
-from gcar_export.training.dataset import training_scene
+from gcar_export.training.dataset import PATH_CELLS, training_scene
 from gcar_export.training.examinations import FINE_CELLS_MM, PAPER_CELLS_MM
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
@@ -165,6 +165,7 @@ def _spec(
             "inputs": {"view_features": VIEW_FEATURES, "levels": LEVELS, "net_pixels": 128},
             "outputs": ["confidence", "offset_cells x y z", "radius_cells"],
             "spacing_mm": [FINE_CELLS_MM[0], PAPER_CELLS_MM[1]],
+            "path_cells": list(PATH_CELLS),
             "geometry": "2 views or more, 25 .. 155 deg apart",
         }
     config = net.config

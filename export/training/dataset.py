@@ -30,6 +30,8 @@ from gcar_export.training.examinations import (
     lattice_of,
 )
 
+#: thresholds of the hull that scenes are drawn with, cells of path; a few are lower
+PATH_CELLS = (0.15, 0.5)
 #: scenes with fewer candidates, or vessel among them, are drawn again, as are larger ones
 FEWEST_POINTS, FEWEST_VESSEL = 300, 60
 #: a vessel thinner than this counts as so thick where cells are judged: it must fill some cell
