@@ -10,6 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import click
 
+from gcar_deploy.config import RunOptions
 from gcar_deploy.inputs.order import (
     MOST_VIEWS,
     POSES,
@@ -26,12 +27,13 @@ _Option: TypeAlias = Callable[[Any], Any]
 _FILE = click.Path(path_type=Path)
 
 
-def _choice(name: str, choices: tuple[str, ...], text: str) -> _Option:
+def _choice(name: str, choices: tuple[str, ...], usual: str, text: str) -> _Option:
     # No default value: what is not said leaves an order file, or a running engine, its own.
     kind = click.Choice(list(choices))
-    return click.option(f"--{name}", type=kind, show_default=choices[0], help=text)
+    return click.option(f"--{name}", type=kind, show_default=usual, help=text)
 
 
+_USUAL = RunOptions()
 #: field of the order -> option; in the order of help
 OPTIONS: Mapping[str, _Option] = {
     "geometry": click.option(
@@ -39,9 +41,12 @@ OPTIONS: Mapping[str, _Option] = {
     ),
     "out": click.option("--out", type=_FILE, help="New folder for what is written."),
     "predictor": _choice(
-        "predictor", PREDICTORS, "Who decides depth: a model, or none (the visual hull is thinned)."
+        "predictor", PREDICTORS, _USUAL.predict.predictor,
+        "Who decides depth: a model, or none (the visual hull is thinned).",
     ),
-    "refiner": _choice("refiner", REFINERS, "How the tree is fitted to the pictures."),
+    "refiner": _choice(
+        "refiner", REFINERS, _USUAL.refine.refiner, "How the tree is fitted to the pictures."
+    ),
     "deadline_s": click.option(
         "--deadline", "deadline_s", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS",
         help="End the refinement with what it has after so long.",
@@ -59,9 +64,12 @@ OPTIONS: Mapping[str, _Option] = {
         help="DICOM without it: source to isocentre.",
     ),
     "segmenter": _choice(
-        "segmenter", SEGMENTERS, "Who finds vessels in raw pictures; auto takes the mean of both."
+        "segmenter", SEGMENTERS, _USUAL.imaging.segmenter,
+        "Who finds vessels in raw pictures; auto takes the mean of both.",
     ),
-    "pose": _choice("pose", POSES, "Whether shift and turn between the runs are estimated."),
+    "pose": _choice(
+        "pose", POSES, "auto", "Whether shift and turn between the runs are estimated."
+    ),
     "landmarks": click.option(
         "--landmark", "landmarks", multiple=True, metavar="C1,R1:C2,R2",
         help="Column and row of one point in each view (- where unseen); repeatable.",
