@@ -14,7 +14,7 @@ from gcar_deploy.config import PredictOptions, RunOptions, check_options
 from gcar_deploy.config.ranges import Range, check_number
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.imaging.extract import asks_network
-from gcar_deploy.imaging.net import Segmenter, check_segmenter, load_segmenter
+from gcar_deploy.imaging.net import Segmenter, load_segmenter
 from gcar_deploy.inputs.order import Order, check_views
 from gcar_deploy.inputs.pictures import Geometry, Mask, Picture, prepare
 from gcar_deploy.output.bundle import check_extras
@@ -61,7 +61,6 @@ class Engine:
         self.threads = threads or min(os.cpu_count() or 1, 4)
         wanted = self.options.predict
         self._predictor = load_predictor(model, wanted, threads=self.threads, session=session)
-        check_segmenter(self.options.imaging.segmenter)
         self._segmenter: Segmenter | None = None
         self._further: dict[str, Predictor | None] = {}
         self._lock = threading.Lock()
@@ -90,7 +89,6 @@ class Engine:
 
     def _needed_segmenter(self, wanted: str) -> Segmenter | None:
         """Load the network that finds vessels once, when a picture first needs it."""
-        check_segmenter(wanted)
         if wanted == "classic":
             return None
         with self._lock:

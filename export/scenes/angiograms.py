@@ -11,7 +11,6 @@ import dataclasses
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.net import net_input
 from gcar_deploy.types import Array, Image, Mask
@@ -89,9 +88,7 @@ def generated_angiogram(seed: int, index: int, lenient: bool = False) -> Generat
     )
 
 
-def training_pair(
-    seed: int, index: int, options: ImagingOptions, lenient: bool = False
-) -> tuple[Array, Array]:
+def training_pair(seed: int, index: int, lenient: bool = False) -> tuple[Array, Array]:
     """Return the network's input and truth of a picture, flipped at random.
 
     The input is made by the code that makes it at run time, collimator search included.
@@ -106,8 +103,8 @@ def training_pair(
     pixels = made.pixels.astype(np.float32)
     holes = enhance.collimator(pixels)
     white = max(float(np.percentile(pixels, 99.5)), 1e-12)
-    picture = enhance.absorbance(pixels / np.float32(white), options.log_offset)
-    channels = net_input(picture, holes, made.told_mm, options)
+    picture = enhance.absorbance(pixels / np.float32(white))
+    channels = net_input(picture, holes, made.told_mm)
     weight = np.where(made.unsure, 0.0, 1.0)
     if lenient:
         weight[made.device] = LENIENT_WEIGHT

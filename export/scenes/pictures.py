@@ -9,18 +9,17 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.extract import CONTRAST_ERROR, MASK_ERROR
 from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.types import Array, Image, Mask
 
-_IMAGING = ImagingOptions()
 #: kinds of input with the relative error of their paths, as the runtime gives it
 PATH_ERRORS = {
     "exact": 0.0,
     "noisy": 0.0,
-    "uncertain": _IMAGING.contrast_error,
-    "mask": _IMAGING.mask_error,
+    "uncertain": CONTRAST_ERROR,
+    "mask": MASK_ERROR,
 }
 #: shortest path that a mask's pixel shows, mm
 LEAST_MM = 0.02

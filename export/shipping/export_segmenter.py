@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging.net import INPUT, KIND, OUTPUTS, STRIDE, open_segmenter
 from gcar_export.scenes.angiograms import training_pair
@@ -143,7 +142,7 @@ def _largest_difference(net: torch.nn.Module, out: Path, pictures: int) -> float
     session = open_segmenter(out, threads=1)
     worst = 0.0
     for k in range(pictures):
-        channels = training_pair(PARITY_SEED, k, ImagingOptions())[0]
+        channels = training_pair(PARITY_SEED, k)[0]
         if k % 2:  # another shape than the one it was traced with
             channels = np.ascontiguousarray(channels[:, : -3 * STRIDE, :-STRIDE])
         with torch.no_grad():

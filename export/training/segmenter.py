@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from gcar_deploy.config import ImagingOptions
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 
@@ -109,7 +108,7 @@ class Stream(torch.utils.data.Dataset):
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         cv2.setNumThreads(1)
-        x, y = training_pair(self.seed, index, ImagingOptions(), index >= self.lenient_from)
+        x, y = training_pair(self.seed, index, index >= self.lenient_from)
         return torch.from_numpy(x), torch.from_numpy(y)
 
 

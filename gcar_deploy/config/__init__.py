@@ -6,7 +6,7 @@ import dataclasses
 from typing import TypeAlias
 
 from gcar_deploy.config.pictures import (
-    CatheterOptions,
+    SEGMENTERS,
     DicomLimits,
     DicomOptions,
     ImagingOptions,
@@ -14,26 +14,36 @@ from gcar_deploy.config.pictures import (
 )
 from gcar_deploy.config.pose import BundleOptions, PoseOptions
 from gcar_deploy.config.predict import (
+    PREDICTORS,
     CandidateOptions,
     DecideOptions,
     ModelLimits,
     PredictOptions,
+    Predictor,
     SingleViewOptions,
 )
 from gcar_deploy.config.quality import QualityOptions
 from gcar_deploy.config.ranges import check_options
 from gcar_deploy.config.refine import (
+    BACKENDS,
+    DEVICES,
+    REFINERS,
     PaperOptions,
     RefineOptions,
+    Refiner,
     TreeOptions,
     TubeOptions,
     VolumeOptions,
 )
 
 __all__ = [
+    "BACKENDS",
+    "DEVICES",
+    "PREDICTORS",
+    "REFINERS",
+    "SEGMENTERS",
     "BundleOptions",
     "CandidateOptions",
-    "CatheterOptions",
     "DecideOptions",
     "DicomLimits",
     "DicomOptions",
@@ -44,8 +54,10 @@ __all__ = [
     "PictureLimits",
     "PoseOptions",
     "PredictOptions",
+    "Predictor",
     "QualityOptions",
     "RefineOptions",
+    "Refiner",
     "RunOptions",
     "SingleViewOptions",
     "TreeOptions",

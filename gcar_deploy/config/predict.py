@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias, get_args
 
 from gcar_deploy.config.ranges import Range, Scale, Share, Size
+
+Predictor: TypeAlias = Literal["auto", "multi", "single", "none"]
+PREDICTORS = get_args(Predictor)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,8 +72,9 @@ class SingleViewOptions:
 class PredictOptions:
     """Which Gaussian centre predictor to use, and how."""
 
-    #: ``auto`` (the shipped model where there is one), ``multi``, ``single`` or ``none``
-    predictor: str = "auto"
+    #: ``auto``: the shipped multi-view model, or the kind of the one given; ``none``: the visual
+    #: hull is thinned
+    predictor: Predictor = "auto"
     #: lattices on which the multi-view predictor judges the scene, each shifted against the others;
     #: after the first only what lies near points of at least this confidence is asked again
     looks: Annotated[int, Range(1, 4)] = 2

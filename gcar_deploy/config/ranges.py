@@ -13,7 +13,7 @@ import math
 import numbers
 import types
 import typing
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from gcar_deploy.errors import UsageError
 
@@ -93,7 +93,9 @@ def _check(key: str, value: Any, hint: Any, rule: Range | None = None) -> None:
         (hint,) = (part for part in typing.get_args(hint) if part is not types.NoneType)
     if typing.get_origin(hint) is Annotated:
         hint, rule = typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
+    if typing.get_origin(hint) is Literal:
+        check_choice(f"option {key}", value, typing.get_args(hint))
+    elif dataclasses.is_dataclass(hint):
         if not isinstance(value, typing.cast(type, hint)):
             raise _refusal(f"option {key}", value, f"{typing.cast(type, hint).__name__}(...)")
         check_options(value, f"{key}.")
@@ -126,6 +128,18 @@ def check_number(key: str, value: Any, hint: type, rule: Range | None) -> None:
         raise _refusal(key, value, what)
     if rule is not None and not rule.least <= float(value) <= rule.most:
         raise _refusal(key, value, what)
+
+
+def check_choice(key: str, value: Any, known: tuple[str, ...]) -> None:
+    """Refuse what is none of the ``known`` words.
+
+    Raises
+    ------
+    UsageError
+        One line that begins with ``key``.
+    """
+    if not isinstance(value, str) or value not in known:
+        raise _refusal(key, value, f"one of {', '.join(known)}")
 
 
 def _refusal(key: str, value: Any, what: str) -> UsageError:

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias, get_args
 
 from gcar_deploy.config.ranges import Count, Length, Range, Scale, Share
+
+Refiner: TypeAlias = Literal["tube", "paper", "none"]
+REFINERS = get_args(Refiner)
+Backend: TypeAlias = Literal["numpy", "torch"]
+BACKENDS = get_args(Backend)
+Device: TypeAlias = Literal["cpu", "cuda"]
+DEVICES = get_args(Device)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,17 +162,16 @@ class PaperOptions:
     #: stop when the best of so many steps is not better by this share
     patience: Annotated[int, Range(1, 1_000_000)] = 20
     tolerance: Share = 2e-3
-    #: what projects: ``numpy``, or ``torch`` (the reference twin) on ``cpu`` or ``cuda``
-    backend: str = "numpy"
-    device: str = "cpu"
+    #: what projects: NumPy, or its reference twin
+    backend: Backend = "numpy"
+    device: Device = "cpu"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RefineOptions:
     """The Gaussian refinement."""
 
-    #: ``tube`` (default), ``paper`` or ``none``
-    refiner: str = "tube"
+    refiner: Refiner = "tube"
     tube: TubeOptions = dataclasses.field(default_factory=TubeOptions)
     paper: PaperOptions = dataclasses.field(default_factory=PaperOptions)
     volume: VolumeOptions = dataclasses.field(default_factory=VolumeOptions)

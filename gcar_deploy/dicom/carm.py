@@ -13,6 +13,10 @@ from gcar_deploy.dicom.header import Header, tag
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CArm
 
+#: tilt of the detector against the beam: said above the first, refused above the second
+_GOOD_TILT_DEG, _MAX_TILT_DEG = 0.1, 1.0
+#: share by which SDD / SOD may differ from the file's own magnification factor
+_MAGNIFICATION_SHARE = 0.02
 _WAY_OUT = "give the geometry with --geom"
 
 
@@ -41,7 +45,7 @@ def frame_carm(header: Header, frame: int, options: DicomOptions) -> tuple[CArm,
         primary, secondary = _angles(header, frame)
         sod, sdd = _distances(header, frame, options, notes)
         spacing = _spacing(header, frame, options, notes)
-        _check_tilt(header, frame, options, notes)
+        _check_tilt(header, frame, notes)
         rotation = _rotation(header, frame, notes)
         carm = CArm(
             primary_angle_deg=primary,
@@ -125,7 +129,7 @@ def _distances(
     if sod and options.sod_mm is not None and abs(sod - options.sod_mm) > 0.5:
         notes.append(f"says {sod:g} mm source to isocentre itself; --sod is not used for it")
     sod = sod or float(options.sod_mm or 0.0)
-    if factor and abs(sdd / sod / factor - 1.0) > options.magnification_share:
+    if factor and abs(sdd / sod / factor - 1.0) > _MAGNIFICATION_SHARE:
         notes.append(
             f"{tag('EstimatedRadiographicMagnificationFactor')} = {factor:g} is at odds with "
             f"SDD / SOD = {sdd / sod:.3f}: is one of the distances to something else?"
@@ -155,15 +159,15 @@ def _spacing(
     return own
 
 
-def _check_tilt(header: Header, frame: int, options: DicomOptions, notes: list[str]) -> None:
+def _check_tilt(header: Header, frame: int, notes: list[str]) -> None:
     for keyword in ("DetectorPrimaryAngle", "DetectorSecondaryAngle"):
         tilt = header.number(keyword, frame) or 0.0
-        if abs(tilt) > options.max_tilt_deg:
+        if abs(tilt) > _MAX_TILT_DEG:
             raise GeometryError(
                 f"{tag(keyword)} = {tilt:g} deg: the detector is tilted against the beam "
-                f"(at most {options.max_tilt_deg:g} deg); {_WAY_OUT} and a projection_matrix"
+                f"(at most {_MAX_TILT_DEG:g} deg); {_WAY_OUT} and a projection_matrix"
             )
-        if abs(tilt) > options.good_tilt_deg:
+        if abs(tilt) > _GOOD_TILT_DEG:
             notes.append(f"{tag(keyword)} = {tilt:g} deg is neglected")
 
 

@@ -8,12 +8,15 @@ import itertools
 import cv2
 import numpy as np
 
-from gcar_deploy.config import DicomOptions
 from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import Header
 from gcar_deploy.errors import UsageError
 from gcar_deploy.types import Array, Scalars
 
+#: frames filled to this share of the best are compared by their stillness
+_FILLED_SHARE = 0.9
+#: a frame named by the file but filled less than this share of the best is worth a word
+_LEAST_FILLED_SHARE = 0.5
 #: frames are compared at this size, pixels along the longer side
 _SIDE = 192
 
@@ -34,14 +37,13 @@ class Choice:
     note: str | None = None
 
 
-def choose_frame(frames: Frames, wanted: int | None, options: DicomOptions) -> Choice:
+def choose_frame(frames: Frames, wanted: int | None) -> Choice:
     """Take the frame asked for, else one at an R wave, the file's own, or the best filled.
 
     Parameters
     ----------
     frames : Frames
     wanted : int from 1, or None to choose
-    options : DicomOptions
 
     Raises
     ------
@@ -61,17 +63,15 @@ def choose_frame(frames: Frames, wanted: int | None, options: DicomOptions) -> C
     beats = r_wave_frames(header)
     if beats:
         best = max(beats, key=lambda k: filling[k])
-        return Choice(
-            index=best, reason="the best filled at an R wave", note=_doubt(filling, best, options)
-        )
+        return Choice(index=best, reason="the best filled at an R wave", note=_doubt(filling, best))
     own = header.number("RepresentativeFrameNumber")
     if own is not None and 1 <= own <= len(frames):
         index = int(own) - 1
         return Choice(
             index=index, reason="the file's representative frame",
-            note=_doubt(filling, index, options),
+            note=_doubt(filling, index),
         )  # fmt: skip
-    full = np.flatnonzero(filling >= options.filled_share)
+    full = np.flatnonzero(filling >= _FILLED_SHARE)
     index = int(full[np.argmin(motion[full])])
     return Choice(index=index, reason="the stillest of the well filled ones")
 
@@ -132,8 +132,8 @@ def _small(picture: Array) -> Array:
     return cv2.GaussianBlur(level.astype(np.float32), (0, 0), 1.0)
 
 
-def _doubt(filling: Scalars, index: int, options: DicomOptions) -> str | None:
-    if filling[index] >= options.least_filled_share:
+def _doubt(filling: Scalars, index: int) -> str | None:
+    if filling[index] >= _LEAST_FILLED_SHARE:
         return None
     return (
         f"frame {index + 1} holds less contrast than frame {int(np.argmax(filling)) + 1} of the "

@@ -54,7 +54,7 @@ def read_run(path: str | Path, options: DicomOptions, wanted: int | None = None)
     """
     header = read_header(path, options.limits)
     frames = Frames(header)
-    choice = choose_frame(frames, wanted, options)
+    choice = choose_frame(frames, wanted)
     pixels = frames.decode(choice.index)
     valid = open_field(header, choice.index)
     if is_flipped(header, choice.index):

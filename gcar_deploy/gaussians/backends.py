@@ -10,14 +10,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+from gcar_deploy.config import BACKENDS, DEVICES
+from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.gaussians.project import Gradient, project, project_vjp
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.types import Array
 
-BACKENDS = ("numpy", "torch")
-DEVICES = ("cpu", "cuda")
 #: stated agreement of the two backends in float64
 PICTURE_TOLERANCE = 2e-3
 GRADIENT_TOLERANCE = 5e-3
@@ -39,10 +39,8 @@ def backend_named(name: str, device: str = "cpu") -> Backend:
     UsageError
         Unknown, on a device it has not, or not installed.
     """
-    if name not in BACKENDS:
-        raise UsageError(f"backend {name!r} is none of {', '.join(BACKENDS)}")
-    if device not in DEVICES:
-        raise UsageError(f"device {device!r} is none of {', '.join(DEVICES)}")
+    check_choice("backend", name, BACKENDS)
+    check_choice("device", device, DEVICES)
     if name == "numpy":
         if device != "cpu":
             raise UsageError(f"device {device} needs the backend torch; numpy runs on cpu")

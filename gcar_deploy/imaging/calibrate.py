@@ -40,9 +40,8 @@ class PathEstimate:
 
 
 def estimate_path(
-    candidates: dict[str, Image], found: Segmentation, pixel_mm: float, margin_px: float,
-    fill_px: float,
-) -> PathEstimate:  # fmt: skip
+    candidates: dict[str, Image], found: Segmentation, pixel_mm: float
+) -> PathEstimate:
     """Choose the grey-value law under which contrast and width agree best, and its scale.
 
     A vessel's cross-section is nearly round, so the longest chord through it equals the width
@@ -55,16 +54,13 @@ def estimate_path(
     candidates : domain name -> (rows, cols) float32 picture, vessels bright
     found : Segmentation
     pixel_mm : float, pixel size at the isocentre
-    margin_px, fill_px : float, of the filled-in background
     """
     chosen = _simple_stretches(found)
     best: PathEstimate | None = None
     for domain, picture in candidates.items():
-        ground = enhance.background(
-            enhance.fill_holes(picture, ~found.valid), found.mask, margin_px, fill_px
-        )
+        ground = enhance.background(enhance.fill_holes(picture, ~found.valid), found.mask, pixel_mm)
         contrast = np.where(found.valid, picture - ground, np.float32(0))
-        scale, spread = _agreement(contrast, found, chosen, margin_px, pixel_mm)
+        scale, spread = _agreement(contrast, found, chosen, pixel_mm)
         if best is None or spread < best.spread:
             path = np.where(found.mask, np.clip(contrast, 0, None), np.float32(0)) * scale
             best = PathEstimate(
@@ -94,13 +90,14 @@ def _simple_stretches(found: Segmentation) -> Mask:
 
 
 def _agreement(
-    contrast: Image, found: Segmentation, chosen: Mask, margin_px: float, pixel_mm: float
+    contrast: Image, found: Segmentation, chosen: Mask, pixel_mm: float
 ) -> tuple[float, float]:
     """Return (mm per unit of contrast, relative spread).
 
     The width comes from the profile itself, not from where the mask was cut: a chord profile
     of peak p has the area A = (pi/2) R p, hence 2 R = 4 A / (pi p).
     """
+    margin_px = enhance.MARGIN_MM / pixel_mm
     reach = 2 * max(1, round(margin_px)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     shadow = cv2.dilate(found.mask.astype(np.uint8), disc) > 0

@@ -13,12 +13,33 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gcar_deploy.config import CatheterOptions
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
 from gcar_deploy.types import Image, Mask, Scalars
 
+#: a catheter comes within this distance of the border of the field, mm
+BORDER_MM = 3.0
+#: from the border to the tip; a side branch shorter than the spur is none, mm
+SHORTEST_MM, LONGEST_MM = 5.0, 80.0
+SPUR_MM = 8.0
+#: width at half height, blur included (8 F are 2.7 mm), and its standard deviation along the
+#: catheter as a share of it
+WIDEST_MM = 4.2
+UNEVENNESS = 0.06
+#: the vessel beyond the tip is this many times wider, its narrow places (lower 30 %) too
+STEP, LEAST_STEP = 1.5, 1.1
+#: and it is a main one: its width as a share of the 90th percentile of all
+VESSEL_SHARE = 0.6
+#: no vessel goes through the place where it ends: two arms at least this wide (share of the
+#: widest) and this straight
+ARM_SHARE = 0.65
+THROUGH_DEG = 150.0
+#: a line from border to border as long as this share of the picture's shorter side that stays
+#: close to its chord (90 % of it, as a share of the chord) is a lead or a wire
+CROSSING_SHARE, CROSSING_OFF_SHARE = 0.6, 0.025
+#: more of the line than this is never taken for catheters
+LARGEST_SHARE = 0.25
 #: offsets at which a profile across the line is sampled, pixels, and its farthest one in mm
 _OFFSET_STEP = 0.25
 _PROFILE_MM = 6.0
@@ -40,7 +61,6 @@ def catheters(
     sigma_px: Image,
     valid: Mask,
     pixel_mm: float,
-    options: CatheterOptions,
 ) -> Mask:
     """Pixels of ``line`` that are taken for catheter.
 
@@ -55,7 +75,6 @@ def catheters(
     valid : (rows, cols) bool
         The field; a line that comes within reach of its border or the picture's may be one.
     pixel_mm : float, at the isocentre
-    options : CatheterOptions
 
     Returns
     -------
@@ -68,37 +87,29 @@ def catheters(
     framed = cv2.copyMakeBorder(valid.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     inward = cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1] * pixel_mm
     graph = LineGraph(line)
-    ends = graph.ends(line & (inward <= options.border_mm + 0.5 * options.widest_mm))
+    ends = graph.ends(line & (inward <= BORDER_MM + 0.5 * WIDEST_MM))
     if not ends:
         return found
     width = line_widths(line, flat, sigma_px, pixel_mm)
     widest = float(np.quantile(width[line], 0.9))
-    for pixels in _crossings(graph, ends, min(line.shape), options):
+    for pixels in _crossings(graph, ends, min(line.shape)):
         found[tuple(np.transpose(pixels))] = True
     crossing = found
-    cuts = [
-        _cut(graph, end, width, widest, inward, pixel_mm, options) for end in ends if not found[end]
-    ]
+    cuts = [_cut(graph, end, width, widest, inward, pixel_mm) for end in ends if not found[end]]
     # The clearest first, as long as most of the line stays.
     for _, pixels in sorted((c for c in cuts if c is not None), reverse=True):
         tried = found.copy()
         tried[tuple(np.transpose(pixels))] = True
-        if (tried & ~crossing).sum() * pixel_mm <= options.largest_share * total_mm:
+        if (tried & ~crossing).sum() * pixel_mm <= LARGEST_SHARE * total_mm:
             found = tried
     return found
 
 
-def _crossings(
-    graph: LineGraph, ends: list[Pixel], side_px: int, options: CatheterOptions
-) -> list[list[Pixel]]:
+def _crossings(graph: LineGraph, ends: list[Pixel], side_px: int) -> list[list[Pixel]]:
     """Lines from border to border that stay close to their chord: longer than any vessel does."""
     found = []
     for i, one in enumerate(ends):
-        others = [
-            p
-            for p in ends[:i]
-            if np.hypot(*np.subtract(p, one)) >= options.crossing_share * side_px
-        ]
+        others = [p for p in ends[:i] if np.hypot(*np.subtract(p, one)) >= CROSSING_SHARE * side_px]
         reached = graph.distances(one, np.inf, ()) if others else {}
         for other in others:
             if other not in reached:
@@ -108,7 +119,7 @@ def _crossings(
             row, column = (np.asarray(path) - one).T
             # distance from the chord as a share of the chord
             off = np.abs(row * chord[1] - column * chord[0]) / (chord @ chord)
-            if np.sort(off)[len(off) * 9 // 10] <= options.crossing_off_share:
+            if np.sort(off)[len(off) * 9 // 10] <= CROSSING_OFF_SHARE:
                 found.append(path)
     return found
 
@@ -152,7 +163,6 @@ def _cut(
     widest: float,
     inward: Image,
     pixel_mm: float,
-    options: CatheterOptions,
 ) -> tuple[float, list[Pixel]] | None:
     """Where the line from ``end`` stops being a catheter, if it ever was one.
 
@@ -162,33 +172,30 @@ def _cut(
         Ratio of the narrow places beyond the cut to the wide ones before it.
     pixels : list of Pixel, from the end to the cut, with the spurs in between
     """
-    path, spurs = graph.walk(end, options.spur_mm / pixel_mm, options.longest_mm / pixel_mm)
+    path, spurs = graph.walk(end, SPUR_MM / pixel_mm, LONGEST_MM / pixel_mm)
     beyond = graph.distances(path[-1], (_AFTER_MM[1] + 1) / pixel_mm, path[:-1])
     along = _lengths(path) * pixel_mm
-    passes = _passes_by(graph, path[-1], beyond, width, pixel_mm, options)
+    passes = _passes_by(graph, path[-1], beyond, width, pixel_mm)
     before_mm = width[tuple(np.transpose(path))]
     del beyond[path[-1]]
     place = np.r_[along, [along[-1] + d * pixel_mm for d in beyond.values()]]
     all_at = tuple(np.transpose([*path, *beyond]))
     all_mm = width[all_at]
     # A line that leaves the field looks wider at its border: no place for an ostium.
-    place[inward[all_at] < options.border_mm] = -np.inf
+    place[inward[all_at] < BORDER_MM] = -np.inf
     best: tuple[float, float] | None = None
-    for cut in np.arange(options.shortest_mm, along[-1] + 0.5, 1.0):
+    for cut in np.arange(SHORTEST_MM, along[-1] + 0.5, 1.0):
         if passes and along[-1] < cut + 0.75 * _AFTER_MM[1]:
             break
         before = np.sort(before_mm[along <= cut - _BEFORE_MM])
         low, own, high = (float(before[int(len(before) * q)]) for q in _QUANTILES)
-        if own > options.widest_mm or 0.5 * (high - low) > options.unevenness * own:
+        if own > WIDEST_MM or 0.5 * (high - low) > UNEVENNESS * own:
             continue
         after = np.sort(all_mm[(place >= cut + _AFTER_MM[0]) & (place <= cut + _AFTER_MM[1])])
         if len(after) * pixel_mm < 0.5 * _AFTER_MM[1]:
             continue
         narrow, wide = float(after[len(after) * 3 // 10]), float(after[len(after) * 7 // 10])
-        if (
-            wide >= max(options.step * own, options.vessel_share * widest)
-            and narrow >= options.least_step * own
-        ):
+        if wide >= max(STEP * own, VESSEL_SHARE * widest) and narrow >= LEAST_STEP * own:
             clear = narrow / high
             best = max(best, (clear, float(cut))) if best else (clear, float(cut))
     if best is None:
@@ -214,15 +221,14 @@ def _passes_by(
     beyond: dict[Pixel, float],
     width: Image,
     pixel_mm: float,
-    options: CatheterOptions,
 ) -> bool:
     """Whether a vessel goes through the fork: then the line is its side branch."""
     low, high = (mm / pixel_mm for mm in _FORK_MM)
     stretches = [s for s in graph.branches(beyond, low, high) if len(s) * pixel_mm >= 1.0]
     middle = [np.mean(s, axis=0) - fork for s in stretches]
     wide = [float(np.median([width[p] for p in s])) for s in stretches]
-    arms = [m for m, w in zip(middle, wide, strict=True) if w >= options.arm_share * max(wide)]
-    straight = np.cos(np.radians(options.through_deg))
+    arms = [m for m, w in zip(middle, wide, strict=True) if w >= ARM_SHARE * max(wide)]
+    straight = np.cos(np.radians(THROUGH_DEG))
     return any(
         a @ b < straight * np.linalg.norm(a) * np.linalg.norm(b)
         for i, a in enumerate(arms)

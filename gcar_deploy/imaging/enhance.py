@@ -7,8 +7,21 @@ import dataclasses
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.types import Array, Image, Mask
+
+#: Gaussian widths of the ridge filter: vessel diameters of some 1 to 7 mm
+RIDGE_SIGMA_MM = (0.75, 1.05, 1.5, 2.1)
+#: the ridge must stand above both sides at this many sigma (a step edge has only one)
+SIDE_GAP_SIGMAS = 2.5
+#: response times sigma^power: below 0 a narrow explanation wins over a wide one
+SCALE_POWER = -0.5
+#: what varies more slowly than this is background to the ridge filter
+FLATTEN_SIGMA_MM = 10.0
+#: grey level, as a share of the white level, added before the logarithm
+LOG_OFFSET = 0.08
+#: filled-in background: margin left out round the vessels, and width of the fill (a far wider one
+#: takes over where nothing is near)
+MARGIN_MM, FILL_SIGMA_MM = 1.0, 2.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,15 +38,15 @@ class Ridges:
     sigma_px: Image
 
 
-def absorbance(pixels: Image, offset: float) -> Image:
-    """(rows, cols) -log(grey / white + offset): what absorbs more is brighter.
+def absorbance(pixels: Image) -> Image:
+    """(rows, cols) -log(grey / white + ``LOG_OFFSET``): what absorbs more is brighter.
 
     White is the 99.5th percentile. The offset keeps black finite and halves the gain where a
     display curve has squeezed the dark end; it is a compromise between a linear detector and
     a picture whose logarithm was already taken.
     """
     white = max(float(np.percentile(pixels, 99.5)), 1e-12)
-    return -np.log(np.clip(pixels, 0, None) / white + offset, dtype=np.float32)
+    return -np.log(np.clip(pixels, 0, None) / white + LOG_OFFSET, dtype=np.float32)
 
 
 def collimator(pixels: Image) -> Mask:
@@ -103,17 +116,17 @@ def _wide_blur(picture: Image, sigma_px: float) -> Image:
     return np.asarray(small, dtype=np.float32)
 
 
-def background(picture: Image, vessel: Mask, margin_px: float, sigma_px: float) -> Image:
+def background(picture: Image, vessel: Mask, pixel_mm: float) -> Image:
     """Fill the vessels in from their surroundings by normalised convolution.
 
     Parameters
     ----------
     picture : (rows, cols) float32
     vessel : (rows, cols) bool
-    margin_px : float, left out round the vessels
-    sigma_px : float, width of the fill; a far wider one takes over where nothing is near
+    pixel_mm : float, pixel size at the isocentre
     """
-    reach = 2 * max(1, round(margin_px)) + 1
+    sigma_px = FILL_SIGMA_MM / pixel_mm
+    reach = 2 * max(1, round(MARGIN_MM / pixel_mm)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     weight = 1.0 - cv2.dilate(vessel.astype(np.uint8), disc).astype(np.float32)
     near, near_weight = _blurred_pair(picture, weight, sigma_px)
@@ -181,21 +194,21 @@ def ridge_response(picture: Image, sigma_px: float, gap_sigmas: float) -> Image:
     return np.sqrt(drop * np.clip(-strongest, 0, None)) * np.float32(sigma_px)
 
 
-def ridges(picture: Image, pixel_mm: float, options: ImagingOptions) -> Ridges:
-    """Largest response over the scales of ``options``; ``picture`` has bright vessels."""
+def ridges(picture: Image, pixel_mm: float) -> Ridges:
+    """Largest response over ``RIDGE_SIGMA_MM``; ``picture`` has bright vessels."""
     response = np.zeros_like(picture)
     best = np.ones_like(picture)
-    for sigma in sorted({max(1.0, mm / pixel_mm) for mm in options.ridge_sigma_mm}):
+    for sigma in sorted({max(1.0, mm / pixel_mm) for mm in RIDGE_SIGMA_MM}):
         # relative to the smallest scale, so that units stay those of the picture
-        weight = (sigma * pixel_mm / options.ridge_sigma_mm[0]) ** options.scale_power
-        one = np.float32(weight) * ridge_response(picture, sigma, options.side_gap_sigmas)
+        weight = (sigma * pixel_mm / RIDGE_SIGMA_MM[0]) ** SCALE_POWER
+        one = np.float32(weight) * ridge_response(picture, sigma, SIDE_GAP_SIGMAS)
         larger = one > response
         response[larger] = one[larger]
         best[larger] = sigma
     return Ridges(response=response, sigma_px=best)
 
 
-def vessels_are_dark(pixels: Image, pixel_mm: float, options: ImagingOptions) -> tuple[bool, float]:
+def vessels_are_dark(pixels: Image, pixel_mm: float) -> tuple[bool, float]:
     """Compare the ridges of the picture with those of its negative.
 
     Returns
@@ -205,10 +218,10 @@ def vessels_are_dark(pixels: Image, pixel_mm: float, options: ImagingOptions) ->
         Ratio of the two strengths (99th percentile), >= 1; near 1 means undecided.
     """
     holes = collimator(pixels)
-    flat = flatten(fill_holes(pixels, holes), options.flatten_sigma_mm / pixel_mm)
+    flat = flatten(fill_holes(pixels, holes), FLATTEN_SIGMA_MM / pixel_mm)
     strength = []
     for picture in (-flat, flat):
-        response = ridges(picture, pixel_mm, options).response
+        response = ridges(picture, pixel_mm).response
         strength.append(float(np.percentile(response[~holes], 99)) + 1e-12)
     dark, bright = strength
     return dark >= bright, max(dark, bright) / min(dark, bright)

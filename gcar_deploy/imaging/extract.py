@@ -26,6 +26,21 @@ _log = logging.getLogger(__name__)
 _Grey: TypeAlias = tuple[dict[str, Image], Mask]
 #: polarity is taken from the picture only when one sign answers this much more strongly
 _POLARITY_MARGIN = 1.15
+#: relative error of a path that was judged from contrast, and by the network
+CONTRAST_ERROR, CHORD_ERROR = 0.25, 0.15
+#: ... and from the width of a mask: its edges are off by a part of a pixel, a vessel seen at a
+#: slant is thicker than it is wide, and overlaps show one of two vessels
+MASK_ERROR = 0.3
+#: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's edge p.
+#: A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns in the sampling
+#: of the picture itself
+PATH_THRESHOLD_PIXELS = 0.1
+#: less skeleton than this, or a weaker peak in noise deviations, is no vessel; the network tells
+#: faint vessels from noise by their shape
+MIN_LENGTH_MM = 25.0
+MIN_CONTRAST, NET_MIN_CONTRAST = 6.0, 3.0
+#: and the peak, as a share of the white level, must be seen at all
+MIN_PEAK = 0.03
 #: vessels never fill more than this share of a picture
 _FULL = 0.9
 
@@ -61,11 +76,11 @@ def extract_vessels(
     if not float(pixels.max()) > float(pixels.min()):
         raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")
     if angiogram.intensity.kind == "path_length":
-        return _from_path_length(angiogram, options)
+        return _from_path_length(angiogram)
     if angiogram.intensity.kind == "mask":
-        return _from_mask(angiogram, options)
+        return _from_mask(angiogram)
     if angiogram.mask is not None:
-        return _from_grey(angiogram, _grey_values(angiogram, options), options, None)
+        return _from_grey(angiogram, _grey_values(angiogram), None)
     box = shown_box(pixels)
     return put_back(_seen(cut_out(angiogram, box), options, segmenter), angiogram, box)
 
@@ -76,12 +91,12 @@ def _seen(
     """Find vessels in grey values, by whom the options name."""
     if options.segmenter == "net":
         segmenter = _needed(segmenter)
-    grey = _grey_values(angiogram, options)
+    grey = _grey_values(angiogram)
     if segmenter is None or options.segmenter == "classic":
-        return _from_grey(angiogram, grey, options, None)
+        return _from_grey(angiogram, grey, None)
     if options.segmenter == "net":
-        return _from_grey(angiogram, grey, options, segmenter)
-    return _from_both(angiogram, grey, options, segmenter)
+        return _from_grey(angiogram, grey, segmenter)
+    return _from_both(angiogram, grey, segmenter)
 
 
 def asks_network(angiograms: Sequence[Angiogram]) -> bool:
@@ -99,16 +114,14 @@ def asked_network(
     return segmenter, [] if segmenter or options.segmenter == "net" else [MISSING]
 
 
-def _from_both(
-    angiogram: Angiogram, grey: _Grey, options: ImagingOptions, segmenter: Segmenter
-) -> VesselImage:
+def _from_both(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter) -> VesselImage:
     """Fuse both methods; where one finds no vessel, the other has the say."""
     try:
-        learned = _from_grey(angiogram, grey, options, segmenter)
+        learned = _from_grey(angiogram, grey, segmenter)
     except RefusedError:
-        return _from_grey(angiogram, grey, options, None)
+        return _from_grey(angiogram, grey, None)
     try:
-        return fused(_from_grey(angiogram, grey, options, None), learned)
+        return fused(_from_grey(angiogram, grey, None), learned)
     except RefusedError:
         return learned
 
@@ -126,7 +139,7 @@ def _nothing(angiogram: Angiogram, reason: str) -> RefusedError:
     )
 
 
-def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+def _from_path_length(angiogram: Angiogram) -> VesselImage:
     scale = angiogram.intensity.mm_per_count
     if scale is None:
         raise GeometryError(
@@ -135,7 +148,7 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
         )
     _refuse_dark(angiogram)
     path = np.asarray(angiogram.pixels * np.float32(scale), dtype=np.float32)
-    smallest = options.path_threshold_pixels * angiogram.carm.pixel_at_isocenter_mm
+    smallest = PATH_THRESHOLD_PIXELS * angiogram.carm.pixel_at_isocenter_mm
     valid = np.ones(path.shape, bool) if angiogram.valid is None else angiogram.valid
     mask = vessels_in_noise(path, valid, angiogram.carm.pixel_at_isocenter_mm, smallest)
     if mask is None:
@@ -158,7 +171,7 @@ def _from_path_length(angiogram: Angiogram, options: ImagingOptions) -> VesselIm
     )
 
 
-def _from_mask(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
+def _from_mask(angiogram: Angiogram) -> VesselImage:
     """Chords of round vessels: no brightness is read."""
     _refuse_dark(angiogram)
     valid = np.ones(angiogram.pixels.shape, bool) if angiogram.valid is None else angiogram.valid
@@ -169,16 +182,16 @@ def _from_mask(angiogram: Angiogram, options: ImagingOptions) -> VesselImage:
         raise _nothing(angiogram, "nearly every pixel is full")
     line = skel.skeletonize(mask)
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
-    if line.sum() * pixel_mm < options.min_length_mm:
+    if line.sum() * pixel_mm < MIN_LENGTH_MM:
         raise _nothing(
             angiogram,
-            f"{line.sum() * pixel_mm:.0f} mm of line (needed: {options.min_length_mm:g} mm)",
+            f"{line.sum() * pixel_mm:.0f} mm of line (needed: {MIN_LENGTH_MM:g} mm)",
         )
     return VesselImage(
         view_id=angiogram.view_id,
         carm=angiogram.carm,
         path_mm=mask_path(mask, pixel_mm),
-        path_error=options.mask_error,
+        path_error=MASK_ERROR,
         mask=mask,
         skeleton=line,
         valid=valid,
@@ -201,45 +214,43 @@ def _refuse_dark(angiogram: Angiogram) -> None:
         )
 
 
-def _grey_values(angiogram: Angiogram, options: ImagingOptions) -> _Grey:
+def _grey_values(angiogram: Angiogram) -> _Grey:
     """Pictures with bright vessels, and where there is no picture; see ``bright_vessels``."""
-    dark = is_dark(angiogram, options)
-    pictures, holes = bright_vessels(angiogram.pixels, angiogram.intensity.kind, dark, options)
+    dark = is_dark(angiogram)
+    pictures, holes = bright_vessels(angiogram.pixels, angiogram.intensity.kind, dark)
     return pictures, holes if angiogram.valid is None else holes | ~angiogram.valid
 
 
-def _from_grey(
-    angiogram: Angiogram, grey: _Grey, options: ImagingOptions, segmenter: Segmenter | None
-) -> VesselImage:
+def _from_grey(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter | None) -> VesselImage:
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     pictures, holes = grey
     search = pictures.get("search", next(iter(pictures.values())))
-    path_mm, path_error = None, options.chord_error
+    path_mm, path_error = None, CHORD_ERROR
     if angiogram.mask is not None:
-        found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm, options)
+        found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm)
     elif segmenter is not None:
-        found, path_mm = learned_vessels(pictures, holes, pixel_mm, options, segmenter)
+        found, path_mm = learned_vessels(pictures, holes, pixel_mm, segmenter)
     else:
-        found = segment.segment(search, holes, pixel_mm, options)
+        found = segment.segment(search, holes, pixel_mm)
     if found.catheter_mm > 0:
         _log.info(
             "view %s: %.0f mm of line taken for a catheter and left out",
             angiogram.view_id, found.catheter_mm,
         )  # fmt: skip
     length = found.skeleton.sum() * pixel_mm
-    least = options.min_contrast if segmenter is None else options.net_min_contrast
-    too_faint = found.contrast < least or found.peak < options.min_peak
+    least = MIN_CONTRAST if segmenter is None else NET_MIN_CONTRAST
+    too_faint = found.contrast < least or found.peak < MIN_PEAK
     too_faint &= angiogram.mask is None  # who draws a mask has seen the vessel
-    if length < options.min_length_mm or too_faint:
+    if length < MIN_LENGTH_MM or too_faint:
         raise _nothing(
             angiogram,
             f"{length:.0f} mm of line, {found.peak:.1%} contrast, {found.contrast:.1f} times the "
-            f"noise (needed: {options.min_length_mm:g} mm, {options.min_peak:.0%}, "
+            f"noise (needed: {MIN_LENGTH_MM:g} mm, {MIN_PEAK:.0%}, "
             f"{least:g} times)",
         )
     if path_mm is None:
-        path_mm = _contrast_path(angiogram, pictures, found, options)
-        path_error = options.contrast_error
+        path_mm = _contrast_path(angiogram, pictures, found)
+        path_error = CONTRAST_ERROR
     return VesselImage(
         view_id=angiogram.view_id,
         carm=angiogram.carm,
@@ -259,7 +270,6 @@ def _contrast_path(
     angiogram: Angiogram,
     pictures: dict[str, Image],
     found: segment.Segmentation,
-    options: ImagingOptions,
 ) -> Image:
     """(rows, cols) float32, mm: contrast against the filled-in background, scaled by widths."""
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
@@ -267,8 +277,6 @@ def _contrast_path(
         {name: picture for name, picture in pictures.items() if name != "search"},
         found,
         pixel_mm,
-        options.margin_mm / pixel_mm,
-        options.fill_sigma_mm / pixel_mm,
     )
     _log.info(
         "view %s: %s grey values, %.4g mm per unit, contrast/width spread %.2f",
@@ -279,15 +287,13 @@ def _contrast_path(
     return estimate.path_mm
 
 
-def is_dark(angiogram: Angiogram, options: ImagingOptions) -> bool:
+def is_dark(angiogram: Angiogram) -> bool:
     """Whether vessels are darker than their surroundings: declared, else seen, else usual."""
     declared = angiogram.intensity.polarity
     if declared != "auto":
         return declared == "dark"
     usual = angiogram.intensity.kind == "raw"
-    seen, margin = enhance.vessels_are_dark(
-        angiogram.pixels, angiogram.carm.pixel_at_isocenter_mm, options
-    )
+    seen, margin = enhance.vessels_are_dark(angiogram.pixels, angiogram.carm.pixel_at_isocenter_mm)
     decided = margin >= _POLARITY_MARGIN
     _log.info(
         "view %s: vessels taken as %s (%s, strengths differ by a factor %.2f)",
@@ -297,9 +303,7 @@ def is_dark(angiogram: Angiogram, options: ImagingOptions) -> bool:
     return seen if decided else usual
 
 
-def bright_vessels(
-    pixels: Image, kind: str, dark: bool, options: ImagingOptions
-) -> tuple[dict[str, Image], Mask]:
+def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Image], Mask]:
     """Pictures in which vessels are bright and paths add up, one per grey-value law.
 
     Returns
@@ -318,7 +322,7 @@ def bright_vessels(
         level = float(level.max()) - level
     floor = np.float32(0.5 / white)  # half a count: black stays finite
     return {
-        "search": enhance.absorbance(level, options.log_offset),
+        "search": enhance.absorbance(level),
         "linear": -level,
         "log": -np.log(np.maximum(level, floor)),
     }, holes

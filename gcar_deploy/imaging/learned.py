@@ -14,13 +14,20 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.net import Segmenter, net_input
 from gcar_deploy.types import Image, Mask
 
+#: hysteresis on the network's probability, for paths and for the mask: a path where there is none
+#: costs less than one that is missing
+PATH_LEVELS = (0.6, 0.9)
+MASK_LEVELS = (0.9, 0.98)
+#: an end of a branch shallower than this share of the main vessels is a twig
+TWIG_SHARE = 0.2
+#: rim of the mask, as a share of the path in the middle: what observers draw
+RIM_SHARE = 0.65
 #: paths are averaged over so much of the line before they say where the rim is, mm
 _SMOOTH_MM = 1.5
 
@@ -29,7 +36,6 @@ def learned_vessels(
     pictures: Mapping[str, Image],
     holes: Mask,
     pixel_mm: float,
-    options: ImagingOptions,
     segmenter: Segmenter,
 ) -> tuple[segment.Segmentation, Image]:
     """Find bright vessels and how deep they are.
@@ -41,7 +47,6 @@ def learned_vessels(
         in the path if their law of grey values holds.
     holes : (rows, cols) bool, pixels without picture (collimator)
     pixel_mm : float, pixel size at the isocentre
-    options : ImagingOptions
     segmenter : Segmenter
 
     Returns
@@ -53,22 +58,22 @@ def learned_vessels(
         Length of the ray within vessel, 0 away from vessels; it reaches beyond the mask.
     """
     search = pictures.get("search", next(iter(pictures.values())))
-    work, work_holes, work_mm = segment.at_working_size(search, holes, pixel_mm, options)
-    seen = segmenter.look(net_input(work, work_holes, work_mm, options))
+    work, work_holes, work_mm = segment.at_working_size(search, holes, pixel_mm)
+    seen = segmenter.look(net_input(work, work_holes, work_mm))
     full = search.shape[::-1]
     probability = np.where(work_holes, np.float32(0), seen.probability)
-    reach = support(probability, seen.chord, work_mm, options, options.net_path)
-    reach, device = _without_catheters(reach, work, work_holes, work_mm, options)
+    reach = support(probability, seen.chord, work_mm, PATH_LEVELS)
+    reach, device = _without_catheters(reach, work, work_holes, work_mm)
     near = (segment.resize(reach.astype(np.float32), full) >= 0.5) & ~holes
-    sure = support(probability, seen.chord, work_mm, options, options.net_mask) & reach
+    sure = support(probability, seen.chord, work_mm, MASK_LEVELS) & reach
     chord = np.where(near, segment.resize(seen.chord, full) * np.float32(work_mm), np.float32(0))
     laws = {name: picture for name, picture in pictures.items() if name != "search"}
-    contrast = _scaled_contrast(laws, holes, near, chord, pixel_mm, options)
+    contrast = _scaled_contrast(laws, holes, near, chord, pixel_mm)
     path = np.asarray(0.5 * (chord + contrast), dtype=np.float32)
     surely = (segment.resize(sure.astype(np.float32), full) >= 0.5) & near
-    mask = _drawn(path, surely, pixel_mm, options)
+    mask = _drawn(path, surely, pixel_mm)
     found = dataclasses.replace(
-        segment.given(search, mask, holes, pixel_mm, options),
+        segment.given(search, mask, holes, pixel_mm),
         vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
         catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~near,
         catheter_mm=int(skel.skeletonize(device).sum()) * work_mm,
@@ -80,7 +85,6 @@ def support(
     probability: Image,
     chord: Image,
     pixel_mm: float,
-    options: ImagingOptions,
     levels: tuple[float, float],
 ) -> Mask:
     """Where vessels are: hysteresis on the probability, without twigs and small parts.
@@ -89,7 +93,6 @@ def support(
     ----------
     probability, chord : (rows, cols) float32, as the network says them
     pixel_mm : float
-    options : ImagingOptions
     levels : lower and upper one of the hysteresis
 
     Returns
@@ -102,22 +105,20 @@ def support(
         return np.zeros_like(reach)
     deep = np.asarray(cv2.GaussianBlur(chord, (0, 0), 0.7), dtype=np.float32)
     top = float(np.percentile(deep[line], 90))
-    line = skel.prune(line, deep, options.spur_mm / pixel_mm, options.net_twig_share * top)
+    line = skel.prune(line, deep, segment.SPUR_MM / pixel_mm, TWIG_SHARE * top)
     if line.any():
-        line = skel.strong_parts(line, deep, options.part_share)
+        line = skel.strong_parts(line, deep, segment.PART_SHARE)
     return skel.beside(reach, whole, line)
 
 
-def _without_catheters(
-    reach: Mask, work: Image, holes: Mask, pixel_mm: float, options: ImagingOptions
-) -> tuple[Mask, Mask]:
+def _without_catheters(reach: Mask, work: Image, holes: Mask, pixel_mm: float) -> tuple[Mask, Mask]:
     """(rows, cols) bool each: what stays vessel, and what is taken for a catheter."""
     line = skel.skeletonize(reach)
     taken = np.zeros_like(reach)
-    if options.catheter.reject and line.any():
-        flat = enhance.flatten(work, options.flatten_sigma_mm / pixel_mm)
-        width = enhance.ridges(flat, pixel_mm, options).sigma_px
-        taken = catheters(line, flat, width, ~holes, pixel_mm, options.catheter)
+    if line.any():
+        flat = enhance.flatten(work, enhance.FLATTEN_SIGMA_MM / pixel_mm)
+        width = enhance.ridges(flat, pixel_mm).sigma_px
+        taken = catheters(line, flat, width, ~holes, pixel_mm)
     if not taken.any():
         return reach, taken
     kept = skel.beside(reach, line, line & ~taken)
@@ -130,16 +131,14 @@ def _scaled_contrast(
     near: Mask,
     chord: Image,
     pixel_mm: float,
-    options: ImagingOptions,
 ) -> Image:
     """(rows, cols) float32, mm: contrast under the law that agrees best with the chords."""
     best, agreement = np.zeros_like(chord), -np.inf
     if not near.any():
         return best
-    margin, fill = options.margin_mm / pixel_mm, options.fill_sigma_mm / pixel_mm
     for picture in laws.values():
         filled = enhance.fill_holes(picture, holes)
-        rise = np.clip(filled - enhance.background(filled, near, margin, fill), 0, None)
+        rise = np.clip(filled - enhance.background(filled, near, pixel_mm), 0, None)
         c, q = rise[near].astype(np.float64), chord[near].astype(np.float64)
         if not c.any() or not q.any():
             continue
@@ -150,12 +149,12 @@ def _scaled_contrast(
     return best if agreement > -np.inf else chord
 
 
-def _drawn(path: Image, near: Mask, pixel_mm: float, options: ImagingOptions) -> Mask:
+def _drawn(path: Image, near: Mask, pixel_mm: float) -> Mask:
     """(rows, cols) bool: where an observer would draw the rims, and no thinner than a line."""
     line = skel.skeletonize(near)
     if not line.any():
         return line
-    line = skel.prune(line, path, options.spur_mm / pixel_mm, 0.0)
+    line = skel.prune(line, path, segment.SPUR_MM / pixel_mm, 0.0)
     smooth = cv2.GaussianBlur(path, (0, 0), max(0.7, 0.35 / pixel_mm))
     _, (peak,) = skel.spread(line, (smooth,), _SMOOTH_MM / pixel_mm)
-    return ((smooth > options.rim_share * peak) | line) & near
+    return ((smooth > RIM_SHARE * peak) | line) & near

@@ -16,8 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
-from gcar_deploy.errors import ModelError, UsageError
+from gcar_deploy.config import SEGMENTERS
+from gcar_deploy.config.ranges import check_choice
+from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging import enhance
 from gcar_deploy.models import Kind, Session, read_model
 from gcar_deploy.types import Array, Image, Mask
@@ -27,8 +28,6 @@ STRIDE = 16
 #: what the spec of a fitting model says of its input
 INPUT = {"channels": 3, "stride": STRIDE}
 KIND = Kind("segmenter", "segmenter", INPUT)
-#: who finds vessels in grey values
-CHOICES = ("classic", "net", "auto")
 #: finding where ``auto`` has no network
 MISSING = f"{KIND.shipped}.onnx is not installed: vessels were found by the classical method alone"
 OUTPUTS = ("probability", "chord")
@@ -36,7 +35,7 @@ OUTPUTS = ("probability", "chord")
 _WIDER = 4.0
 
 
-def net_input(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions) -> Array:
+def net_input(picture: Image, holes: Mask, pixel_mm: float) -> Array:
     """Make the network's input from a picture at working size.
 
     Parameters
@@ -44,7 +43,6 @@ def net_input(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOpti
     picture : (rows, cols) float32, vessels bright
     holes : (rows, cols) bool, pixels without picture
     pixel_mm : float, pixel size at the isocentre
-    options : ImagingOptions
 
     Returns
     -------
@@ -54,9 +52,9 @@ def net_input(picture: Image, holes: Mask, pixel_mm: float, options: ImagingOpti
         0 where there is no picture. A gain or an offset of ``picture`` changes nothing.
     """
     filled = enhance.fill_holes(picture, holes)
-    sigma = options.flatten_sigma_mm / pixel_mm
+    sigma = enhance.FLATTEN_SIGMA_MM / pixel_mm
     flat = enhance.flatten(filled, sigma)
-    response = np.where(holes, np.float32(0), enhance.ridges(flat, pixel_mm, options).response)
+    response = np.where(holes, np.float32(0), enhance.ridges(flat, pixel_mm).response)
     inside = ~holes if not holes.all() else np.ones_like(holes)
     low, middle = np.percentile(flat[inside], [16, 50])
     top = float(np.percentile(response[inside], 99))
@@ -149,16 +147,10 @@ def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
     ModelError
         ``net`` is wanted and the network is missing, or it is altered.
     """
-    check_segmenter(wanted)
+    check_choice("segmenter", wanted, SEGMENTERS)
     path = KIND.path
     if wanted == "classic" or (path is None and wanted == "auto"):
         return None
     if path is None:
         raise ModelError("no segmentation network is installed with this version; use classic")
     return open_segmenter(path, threads=threads)
-
-
-def check_segmenter(wanted: str) -> None:
-    """Raise UsageError where nobody of that name finds vessels."""
-    if wanted not in CHOICES:
-        raise UsageError(f"segmenter = {wanted!r} is none of {', '.join(CHOICES)}")

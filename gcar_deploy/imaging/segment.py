@@ -7,11 +7,32 @@ import dataclasses
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.types import Array, Image, Mask
+
+#: vessels are looked for at this pixel size (coarser pictures keep their own)
+WORK_PIXEL_MM = 0.5
+#: hysteresis, as shares of the 99th percentile of the response
+LOW_SHARE, HIGH_SHARE = 0.3, 0.6
+#: connected parts with less than this share of the strongest part's summed response go
+PART_SHARE = 0.08
+#: a side branch shorter than this is a spur; an end weaker than this share goes as well
+SPUR_MM = 7.5
+WEAK_SHARE = 0.4
+#: a straight line as long as this share of the shorter side is a wire or an edge
+STRAIGHT_SHARE = 0.6
+#: rim of the mask: this many noise deviations, but within these shares of the peak
+RIM_NOISE = 9.0
+RIM_LOW, RIM_HIGH = 0.15, 0.65
+#: the upper one is lower where a blur of ``GRAIN_MM`` leaves less than the first of these shares
+#: of the noise, and ``RIM_HIGH`` where it leaves more than the second
+RIM_HIGH_IN_GRAIN = 0.45
+GRAIN_MM = 1.0
+GRAIN_LEFT = (0.55, 0.65)
+#: farthest rim, in units of the ridge filter's sigma
+REACH_SIGMAS = 1.6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,11 +70,10 @@ def segment(
     picture: Image,
     holes: Mask,
     pixel_mm: float,
-    options: ImagingOptions,
 ) -> Segmentation:
     """Find bright vessels.
 
-    The search runs at ``options.work_pixel_mm``, since vessels have a known size in mm; only
+    The search runs at ``WORK_PIXEL_MM``, since vessels have a known size in mm; only
     the rim of the mask is drawn in the picture's own pixels.
 
     Parameters
@@ -61,19 +81,16 @@ def segment(
     picture : (rows, cols) float32, vessels bright
     holes : (rows, cols) bool, pixels without picture (collimator)
     pixel_mm : float, pixel size at the isocentre
-    options : ImagingOptions
     """
     rows, columns = picture.shape
-    work, work_holes, work_mm = at_working_size(picture, holes, pixel_mm, options)
-    flat = enhance.flatten(work, options.flatten_sigma_mm / work_mm)
-    found = enhance.ridges(flat, work_mm, options)
+    work, work_holes, work_mm = at_working_size(picture, holes, pixel_mm)
+    flat = enhance.flatten(work, enhance.FLATTEN_SIGMA_MM / work_mm)
+    found = enhance.ridges(flat, work_mm)
     response = np.where(work_holes, np.float32(0), found.response)
-    line = centreline(response, ~work_holes, work_mm, options)
-    taken = np.zeros_like(line)
-    if options.catheter.reject:
-        taken = catheters(line, flat, found.sigma_px, ~work_holes, work_mm, options.catheter)
+    line = centreline(response, ~work_holes, work_mm)
+    taken = catheters(line, flat, found.sigma_px, ~work_holes, work_mm)
     if taken.any():
-        line = skel.strong_parts(line & ~taken, response, options.part_share)
+        line = skel.strong_parts(line & ~taken, response, PART_SHARE)
     device = _drawn_lines(taken, found.sigma_px)
     full = (columns, rows)
     vesselness = np.where(holes, np.float32(0), resize(response, full))
@@ -84,7 +101,7 @@ def segment(
             mask=nothing, skeleton=nothing, valid=~holes, vesselness=vesselness,
             rim_share=share, peak=0.0, contrast=0.0, catheter=nothing, catheter_mm=0.0,
         )  # fmt: skip
-    rim = _rim(work, flat, line, device, found.sigma_px, work_mm, options)
+    rim = _rim(work, flat, line, device, found.sigma_px, work_mm)
     mask = _draw(picture, holes, line, rim, pixel_mm)
     return Segmentation(
         mask=mask,
@@ -99,37 +116,33 @@ def segment(
     )
 
 
-def at_working_size(
-    picture: Image, holes: Mask, pixel_mm: float, options: ImagingOptions
-) -> tuple[Image, Mask, float]:
+def at_working_size(picture: Image, holes: Mask, pixel_mm: float) -> tuple[Image, Mask, float]:
     """Return picture, holes and pixel size for the search; coarser pictures keep their own."""
     rows, columns = picture.shape
-    scale = min(1.0, pixel_mm / options.work_pixel_mm)
+    scale = min(1.0, pixel_mm / WORK_PIXEL_MM)
     size = (max(16, round(columns * scale)), max(16, round(rows * scale)))
     work = resize(enhance.fill_holes(picture, holes), size)
     return work, resize(holes.astype(np.float32), size) > 0.1, pixel_mm * columns / size[0]
 
 
-def centreline(response: Image, valid: Mask, pixel_mm: float, options: ImagingOptions) -> Mask:
+def centreline(response: Image, valid: Mask, pixel_mm: float) -> Mask:
     """(rows, cols) bool: hysteresis, small parts, straight wires, spurs and weak ends."""
     if not valid.any():
         return np.zeros_like(valid)
     top = float(np.percentile(response[valid], 99))
     if top <= 0:
         return np.zeros_like(valid)
-    strong = response > options.high_share * top
-    line = skel.skeletonize(skel.parts_touching(response > options.low_share * top, strong))
-    line = skel.strong_parts(line, response, options.part_share)
-    line = _without_wires(line, options.straight_share)
-    line = skel.prune(line, response, options.spur_mm / pixel_mm, options.weak_share * top)
+    strong = response > HIGH_SHARE * top
+    line = skel.skeletonize(skel.parts_touching(response > LOW_SHARE * top, strong))
+    line = skel.strong_parts(line, response, PART_SHARE)
+    line = _without_wires(line)
+    line = skel.prune(line, response, SPUR_MM / pixel_mm, WEAK_SHARE * top)
     if not line.any():
         return line
-    return skel.strong_parts(line, response, options.part_share)
+    return skel.strong_parts(line, response, PART_SHARE)
 
 
-def given(
-    picture: Image, mask: Mask, holes: Mask, pixel_mm: float, options: ImagingOptions
-) -> Segmentation:
+def given(picture: Image, mask: Mask, holes: Mask, pixel_mm: float) -> Segmentation:
     """Take the user's mask as it is; only contrast and noise are measured.
 
     Parameters
@@ -137,12 +150,10 @@ def given(
     picture : (rows, cols) float32, vessels bright
     mask, holes : (rows, cols) bool
     pixel_mm : float, pixel size at the isocentre
-    options : ImagingOptions
     """
     line = skel.skeletonize(mask)
-    margin, fill = options.margin_mm / pixel_mm, options.fill_sigma_mm / pixel_mm
     filled = enhance.fill_holes(picture, holes)
-    rise = filled - enhance.background(filled, mask, margin, fill)
+    rise = filled - enhance.background(filled, mask, pixel_mm)
     peak = float(rise[line].mean()) if line.any() else 0.0
     return Segmentation(
         mask=mask,
@@ -157,9 +168,9 @@ def given(
     )
 
 
-def _without_wires(line: Mask, share: float) -> Mask:
+def _without_wires(line: Mask) -> Mask:
     """Cut straight lines longer than any vessel runs straight: wires, sternum, shutter edges."""
-    length = share * min(line.shape)
+    length = STRAIGHT_SHARE * min(line.shape)
     wires = cv2.HoughLinesP(
         line.astype(np.uint8), 1, np.pi / 360, threshold=int(0.5 * length),
         minLineLength=length, maxLineGap=0.03 * length,
@@ -201,7 +212,6 @@ def _rim(
     device: Mask,
     sigma_px: Image,
     pixel_mm: float,
-    options: ImagingOptions,
 ) -> _Rim:
     """Set the rim's level between noise and peak.
 
@@ -209,20 +219,19 @@ def _rim(
     noise forbids to look for it there. So the level is a multiple of the noise, bounded on
     both sides by shares of the peak.
     """
-    margin, fill = options.margin_mm / pixel_mm, options.fill_sigma_mm / pixel_mm
     distance, (sigma,) = skel.spread(line, (sigma_px,), 3.0)
-    room = options.reach_sigmas * sigma + 1.0 - distance
+    room = REACH_SIGMAS * sigma + 1.0 - distance
     # First the whole reach counts as vessel, then what the first rim encloses.
     grown = room > 0
     for _ in range(2):
         # A catheter is no vessel, but no background either.
-        ground = enhance.background(flat, grown | device, margin, fill)
+        ground = enhance.background(flat, grown | device, pixel_mm)
         rise = cv2.GaussianBlur(flat - ground, (0, 0), 0.8)
         noise = _noise_beside(rise, grown | device)
         _, (peak,) = skel.spread(line, (rise,), 3.0)
         peak = np.maximum(peak, 1e-12)
-        high = _highest_rim(rise, grown | device, noise, pixel_mm, options)
-        level = np.clip(options.rim_noise * noise, options.rim_low * peak, high * peak)
+        high = _highest_rim(rise, grown | device, noise, pixel_mm)
+        level = np.clip(RIM_NOISE * noise, RIM_LOW * peak, high * peak)
         grown = ((rise > level) & (room > 0)) | line
     return _Rim(
         ground=work - flat + ground,
@@ -234,17 +243,15 @@ def _rim(
     )
 
 
-def _highest_rim(
-    rise: Array, found: Mask, noise: float, pixel_mm: float, options: ImagingOptions
-) -> float:
+def _highest_rim(rise: Array, found: Mask, noise: float, pixel_mm: float) -> float:
     """Highest level of the rim as a share of the peak, by what the noise is made of.
 
     Structure of the background passes for vessel if the rim is low; fine grain only makes the
     rim ragged. What a blur leaves of the noise is structure.
     """
-    blurred = cv2.GaussianBlur(rise, (0, 0), max(0.5, options.grain_mm / pixel_mm))
+    blurred = cv2.GaussianBlur(rise, (0, 0), max(0.5, GRAIN_MM / pixel_mm))
     left = _noise_beside(blurred, found) / max(noise, 1e-12)
-    return float(np.interp(left, options.grain_left, (options.rim_high_in_grain, options.rim_high)))
+    return float(np.interp(left, GRAIN_LEFT, (RIM_HIGH_IN_GRAIN, RIM_HIGH)))
 
 
 def _noise_beside(rise: Array, vessel: Mask) -> float:

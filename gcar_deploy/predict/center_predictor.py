@@ -21,8 +21,6 @@ from gcar_deploy.predict.kinds import MULTI, PREDICTORS, SINGLE, read_predictor
 from gcar_deploy.types import Image
 
 _log = logging.getLogger(__name__)
-#: who predicts centres: the shipped multi-view model where there is one, either kind, or nobody
-CHOICES = ("auto", *PREDICTORS, "none")
 
 
 class CenterPredictor:
@@ -144,13 +142,11 @@ def load_predictor(
     Raises
     ------
     UsageError
-        Nobody of that name predicts centres, or a model was given for nobody.
+        A model was given for nobody.
     ModelError
         The model is missing, altered, unfit, or of another kind than the one asked for.
     """
     wanted = options.predictor
-    if wanted not in CHOICES:
-        raise UsageError(f"predictor = {wanted!r} is none of {', '.join(CHOICES)}")
     if wanted == "none":
         if model is not None:
             raise UsageError("predictor none uses no model; leave the model away")

@@ -13,6 +13,7 @@ from gcar_deploy.errors import GeometryError, RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import match_rate
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.extract import PATH_THRESHOLD_PIXELS
 from gcar_deploy.measure.lumen import hidden_share
 from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
@@ -114,15 +115,15 @@ def judge(
         *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
         *check_human_range(tree),
     ]  # fmt: skip
-    least = options.imaging.path_threshold_pixels
-    lumen = [_lumen(tree, v.carm, least * v.carm.pixel_at_isocenter_mm) for v in views]
+    lumen = [_lumen(tree, v.carm) for v in views]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)
     return dataclasses.replace(judged, exchanges=open_)
 
 
-def _lumen(tree: Tree, carm: CArm, least_mm: float) -> Mask:
-    """(rows, cols) bool: where the rays cross more than ``least_mm`` of the tree."""
-    inside: Mask = footprint(tubes_of(tree), carm, 1.0).image((carm.rows, carm.columns)) > least_mm
+def _lumen(tree: Tree, carm: CArm) -> Mask:
+    """(rows, cols) bool: where the rays cross as much of the tree as counts as vessel."""
+    path = footprint(tubes_of(tree), carm, 1.0).image((carm.rows, carm.columns))
+    inside: Mask = path > PATH_THRESHOLD_PIXELS * carm.pixel_at_isocenter_mm
     return inside
 
 

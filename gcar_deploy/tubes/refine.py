@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy.config import RefineOptions, TreeOptions
+from gcar_deploy.config import REFINERS, RefineOptions, TreeOptions
+from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.gaussians import Gaussians
@@ -22,7 +23,6 @@ from gcar_deploy.tubes.gaussians import strung_gaussians
 from gcar_deploy.tubes.volume import tube_volume
 from gcar_deploy.types import Array, Volume
 
-REFINERS = ("tube", "paper", "none")
 OnProgress = Callable[[float], None]
 _FINDINGS = {
     "late": "the deadline left no time to refine",
@@ -99,8 +99,7 @@ def refine(
         If the refiner is unknown or there is no view.
     """
     options = options or RefineOptions()
-    if options.refiner not in REFINERS:
-        raise UsageError(f"refiner {options.refiner!r} is none of {', '.join(REFINERS)}")
+    check_choice("refiner", options.refiner, REFINERS)
     if not views:
         raise UsageError("refinement needs at least one view")
     budget = budget or Budget()

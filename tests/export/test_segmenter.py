@@ -93,7 +93,7 @@ def test_a_catheter_comes_from_a_border_and_is_no_vessel():
 def test_input_and_truth_belong_together():
     """The network's own channels are larger on vessel than off it, flips included."""
     for i in range(4):
-        channels, truth = training_pair(7, i, ImagingOptions())
+        channels, truth = training_pair(7, i)
         assert channels.shape == (3, SIDE, SIDE) and channels.dtype == np.float32
         assert truth.shape == (3, SIDE, SIDE) and truth.dtype == np.float32
         vessel, asked, chord = truth
@@ -108,8 +108,8 @@ def test_input_does_not_depend_on_gain_or_offset():
     picture = cv2.GaussianBlur(rng.normal(size=(64, 80)).astype(np.float32), (0, 0), 2)
     holes = np.zeros((64, 80), bool)
     holes[:4] = True
-    one = net_input(picture, holes, 0.5, ImagingOptions())
-    other = net_input(7 * picture + 3, holes, 0.5, ImagingOptions())
+    one = net_input(picture, holes, 0.5)
+    other = net_input(7 * picture + 3, holes, 0.5)
     np.testing.assert_allclose(one, other, atol=2e-3)
     assert not one[:, :4].any() and np.isfinite(one).all()
 
@@ -189,9 +189,9 @@ def test_support_from_a_certain_probability():
     cv2.line(sure, (10, 60), (110, 60), 0.99, 5)
     cv2.line(sure, (10, 20), (110, 20), 0.9, 5)  # never above the upper threshold
     cv2.circle(sure, (60, 100), 4, 0.99, -1)  # too short to be a vessel
-    reach = support(sure, 5 * sure, 0.5, ImagingOptions(), (0.7, 0.95))
+    reach = support(sure, 5 * sure, 0.5, (0.7, 0.95))
     assert reach[60, 10:110].all() and not reach[:40].any() and not reach[80:].any()
-    assert not support(0 * sure, sure, 0.5, ImagingOptions(), (0.7, 0.95)).any()
+    assert not support(0 * sure, sure, 0.5, (0.7, 0.95)).any()
 
 
 def test_size_of_the_network():

@@ -19,8 +19,8 @@ from tests.gaussians.test_project import carm, random_gaussians
 @pytest.mark.parametrize(
     ("name", "device", "words"),
     [
-        ("jax", "cpu", "none of numpy, torch"),
-        ("torch", "tpu", "none of cpu, cuda"),
+        ("jax", "cpu", "one of numpy, torch"),
+        ("torch", "tpu", "one of cpu, cuda"),
         ("numpy", "cuda", "needs the backend torch"),
     ],
 )

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import enhance, segment
 from tests.imaging.phantoms import PIXEL_MM, raw_picture, tube_paths
 
@@ -56,9 +55,9 @@ def test_step_edge_answers_much_less_than_a_line():
 
 
 def test_polarity_is_seen_and_symmetric():
-    picture, options = raw_picture(tube_paths()), ImagingOptions()
-    dark, margin = enhance.vessels_are_dark(picture, PIXEL_MM, options)
-    bright, other = enhance.vessels_are_dark(255 - picture, PIXEL_MM, options)
+    picture = raw_picture(tube_paths())
+    dark, margin = enhance.vessels_are_dark(picture, PIXEL_MM)
+    bright, other = enhance.vessels_are_dark(255 - picture, PIXEL_MM)
     assert dark and not bright
     assert margin > 3 and other > 3
 
@@ -79,7 +78,7 @@ def test_background_fills_a_plane_in_to_a_tenth_of_the_contrast():
     plane = 0.5 * row - 0.2 * column
     vessel = np.zeros((96, 96), bool)
     vessel[45:51, 10:80] = True
-    filled = enhance.background(plane + 30 * vessel, vessel, 2.0, 5.0)
+    filled = enhance.background(plane + 30 * vessel, vessel, 0.5)
     assert np.abs(filled - plane)[vessel].max() < 2.0
 
 
@@ -88,7 +87,7 @@ def test_straight_wire_goes_and_a_bent_vessel_stays():
     cv2.ellipse(vessel, (100, 100), (60, 45), 0, 0, 250, 1, 1)
     both = vessel.copy()
     cv2.line(both, (185, 0), (170, 199), 1, 1)
-    left = segment._without_wires(both > 0, 0.6)
+    left = segment._without_wires(both > 0)
     assert (left & (vessel > 0)).sum() >= 0.98 * (vessel > 0).sum()
     assert left[:, 165:].sum() < 20  # of 200
 
@@ -100,13 +99,13 @@ def _noisy_tube(blur_px: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("blur_px, grain", [(0.0, True), (6.0, False)])
-def test_the_rim_goes_lower_in_grain_than_in_structure(blur_px, grain):
+def test_the_rim_goes_lower_in_grain_than_in_structure(blur_px, grain, monkeypatch):
     found = {}
     for share in (0.45, 0.65):
-        options = ImagingOptions(rim_high_in_grain=share)
-        picture = enhance.absorbance(_noisy_tube(blur_px).astype(np.float32), options.log_offset)
+        monkeypatch.setattr(segment, "RIM_HIGH_IN_GRAIN", share)
+        picture = enhance.absorbance(_noisy_tube(blur_px).astype(np.float32))
         holes = np.zeros(picture.shape, bool)
-        found[share] = segment.segment(picture, holes, PIXEL_MM, options)
+        found[share] = segment.segment(picture, holes, PIXEL_MM)
     if not grain:
         np.testing.assert_array_equal(found[0.45].mask, found[0.65].mask)
         return

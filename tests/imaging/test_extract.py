@@ -7,7 +7,12 @@ import pytest
 
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import GeometryError, ImageError, RefusedError
-from gcar_deploy.imaging.extract import asks_network, extract_vessels
+from gcar_deploy.imaging.extract import (
+    CONTRAST_ERROR,
+    MASK_ERROR,
+    asks_network,
+    extract_vessels,
+)
 from gcar_deploy.imaging.resample import area_average, coarsened, resized
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
@@ -36,7 +41,7 @@ def test_a_mask_is_read_above_half_and_nothing_of_its_brightness():
     truth = tube_paths()
     binary = extract_vessels(angiogram(truth > 0.5, "mask"), _OPTIONS)
     np.testing.assert_array_equal(binary.mask, truth > 0.5)
-    assert not binary.calibrated and binary.path_error == _OPTIONS.mask_error
+    assert not binary.calibrated and binary.path_error == MASK_ERROR
     assert np.median(binary.path_mm[truth > 1] / truth[truth > 1]) == pytest.approx(1, abs=0.06)
     # grey: an edge drawn softly, any scale, brightness within that means nothing
     grey = np.where(truth > 0.5, 120 + 80 * np.random.default_rng(2).random(truth.shape), 40)
@@ -53,7 +58,7 @@ def test_a_users_mask_cuts_a_mask_and_keeps_the_brightness_of_a_picture():
     np.testing.assert_array_equal(extract_vessels(given, _OPTIONS).mask, (truth > 0.5) & half)
     grey = dataclasses.replace(angiogram(raw_picture(truth, gain=0.06)), mask=truth > 0.5)
     found = extract_vessels(grey, _OPTIONS)
-    assert found.kind == "raw" and found.path_error == _OPTIONS.contrast_error
+    assert found.kind == "raw" and found.path_error == CONTRAST_ERROR
 
 
 def test_masks_need_no_network():
