@@ -142,7 +142,6 @@ def _reconstructed(
     with watch.stage("refine") as report:
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(),
-            tree_options=options.tree,
         ).or_fail()  # fmt: skip
     with watch.stage("tree", keep_if_late=True):
         check_tree(refined.tree, options.quality)

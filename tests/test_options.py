@@ -20,7 +20,7 @@ from gcar_deploy.inspection import inspect_files
 from gcar_deploy.selftest import tiny_case
 
 #: branches of the options whose values reach a reconstruction of pictures in memory
-_USED = ("imaging", "pose", "candidates", "predict", "decide", "tree", "refine", "quality")
+_USED = ("imaging", "pose", "candidates", "predict", "refine", "quality")
 _ODD = (
     0, 1, -1, 2, 5, 0.5, 1e-9, 1e9, -1e9, 10**12, math.inf, -math.inf, math.nan, True, None,
     "x", "", (), (0,), (1.0, 2.0), (None,), [1], b"", 1j,
@@ -58,7 +58,7 @@ HULL = RunOptions(predict=PredictOptions(predictor="none"))
 
 def one_line_or_result(path, value):
     """Reconstruct the tiny case; an error that the project raises on purpose is one line."""
-    learned = path.startswith(("predict.", "decide.", "candidates."))
+    learned = path.startswith(("predict.", "candidates."))
     base = changed(RunOptions(), "predict.predictor", "multi" if learned else "none")
     if path.startswith("refine.paper."):
         base = changed(base, "refine.refiner", "paper")
@@ -113,7 +113,7 @@ def test_threads_and_deadline(value):
 
 def test_numbers_of_other_libraries_are_numbers():
     np = pytest.importorskip("numpy")
-    check_options(PredictOptions(looks=np.int64(3), look_again=np.float32(0.5)))
+    check_options(PredictOptions(looks=np.int64(3), max_cell_mm=np.float32(1.5)))
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ FBP_PAPER = "fbp+paper"
 METHODS = (*RUNTIME_ROWS, FBP_PAPER, *BASELINES)
 #: options of the runtime that a simulated case depends on (not: how files are read).
 _STAGES = (
-    "imaging", "pose", "candidates", "predict", "decide", "tree", "refine", "quality",
+    "imaging", "pose", "candidates", "predict", "refine", "quality",
 )  # fmt: skip
 #: method -> one line for tables and reports.
 DESCRIPTIONS: Mapping[str, str] = {
@@ -134,7 +134,6 @@ class MethodSettings:
             paper = dataclasses.replace(paper, steps=self.paper_steps)
         if not row.centreline_loss:
             paper = dataclasses.replace(paper, alpha=1.0)
-        volume = run.refine.volume
         return dataclasses.replace(
             run,
             imaging=dataclasses.replace(
@@ -148,7 +147,7 @@ class MethodSettings:
                 run.refine,
                 refiner=row.refiner or run.refine.refiner,
                 paper=paper,
-                volume=dataclasses.replace(volume, fuse=volume.fuse and row.fused),
+                fuse=run.refine.fuse and row.fused,
             ),
         )
 

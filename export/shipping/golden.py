@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gcar_deploy.config import CandidateOptions, ModelLimits
+from gcar_deploy.config import CandidateOptions
 from gcar_deploy.errors import UsageError
 from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.imaging.net import open_segmenter
@@ -72,7 +72,7 @@ def write_golden(model: Path, *, force: bool = False) -> Path:
         answers = session.answers(inputs)
         golden = Golden(session.model.sha256, inputs, answers)
         path.write_bytes(golden.to_bytes())
-        check_golden(model.name, golden, lambda names, feed: list(answers.values()), ModelLimits())
+        check_golden(model.name, golden, lambda names, feed: list(answers.values()))
     except BaseException:
         path.unlink(missing_ok=True)
         if old.exists():

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gcar_deploy.config import RunOptions
 from gcar_deploy.models import ModelFile
 from gcar_deploy.predict.center_predictor import (
     Predictor,
@@ -52,15 +51,12 @@ def scores(model: ModelFile | Predictor, scenes: int) -> list[tuple[str, float]]
 
 def confidences(predictor: Predictor, scene: TrainingScene) -> Scalars:
     """(n,) what the runtime makes of a scene, as ``reconstruct`` does it."""
-    options = RunOptions()
     if isinstance(predictor, SingleViewPredictor):
         seen = predictor.predict([(carm, path) for carm, path, _ in scene.views])
-        merged = merge_views(
-            seen, scene.hull, scene.encoded, options.candidates, options.predict.single
-        )
+        merged = merge_views(seen, scene.hull, scene.encoded)
         return merged.confidence
     found = predictor.predict(scene.hull, scene.encoded)
-    return decide(found, scene.encoded, scene.path_error, options.decide).confidence
+    return decide(found, scene.encoded, scene.path_error).confidence
 
 
 class _TorchSession:

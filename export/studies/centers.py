@@ -35,20 +35,15 @@ def predicted(predictor: Predictor, posed: Seen) -> dict[str, Points]:
     ``single``: likewise, merged from single views; ``single, each view``: what each view says
     on its own, lifted along its rays.
     """
-    options = RunOptions()
     if isinstance(predictor, SingleViewPredictor):
         alone = predictor.predict([(v.carm, v.path_mm) for v in posed.views])
-        merged = merge_views(
-            alone, posed.hull, posed.encoded, options.candidates, options.predict.single
-        )
+        merged = merge_views(alone, posed.hull, posed.encoded)
         return {
             "single": merged.points_mm[merged.confidence >= 0.5],
             "single, each view": np.concatenate([view.points_mm for view in alone]),
         }
     error = max(view.path_error for view in posed.views)
-    found = decide(
-        predictor.predict(posed.hull, posed.encoded), posed.encoded, error, options.decide
-    )
+    found = decide(predictor.predict(posed.hull, posed.encoded), posed.encoded, error)
     offset = 0.0 if found.offset_mm is None else found.offset_mm
     return {"multi": (found.points_mm + offset)[found.confidence >= 0.5]}
 

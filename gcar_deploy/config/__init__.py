@@ -16,11 +16,9 @@ from gcar_deploy.config.pose import BundleOptions, PoseOptions
 from gcar_deploy.config.predict import (
     PREDICTORS,
     CandidateOptions,
-    DecideOptions,
     ModelLimits,
     PredictOptions,
     Predictor,
-    SingleViewOptions,
 )
 from gcar_deploy.config.quality import QualityOptions
 from gcar_deploy.config.ranges import check_options
@@ -31,9 +29,7 @@ from gcar_deploy.config.refine import (
     PaperOptions,
     RefineOptions,
     Refiner,
-    TreeOptions,
     TubeOptions,
-    VolumeOptions,
 )
 
 __all__ = [
@@ -44,7 +40,6 @@ __all__ = [
     "SEGMENTERS",
     "BundleOptions",
     "CandidateOptions",
-    "DecideOptions",
     "DicomLimits",
     "DicomOptions",
     "ImagingOptions",
@@ -59,10 +54,7 @@ __all__ = [
     "RefineOptions",
     "Refiner",
     "RunOptions",
-    "SingleViewOptions",
-    "TreeOptions",
     "TubeOptions",
-    "VolumeOptions",
     "check_options",
 ]
 
@@ -80,8 +72,6 @@ class RunOptions:
     bundle: BundleOptions = dataclasses.field(default_factory=BundleOptions)
     candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)
     predict: PredictOptions = dataclasses.field(default_factory=PredictOptions)
-    decide: DecideOptions = dataclasses.field(default_factory=DecideOptions)
-    tree: TreeOptions = dataclasses.field(default_factory=TreeOptions)
     refine: RefineOptions = dataclasses.field(default_factory=RefineOptions)
     quality: QualityOptions = dataclasses.field(default_factory=QualityOptions)
     #: points marked in the pictures, which hold the views to each other

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Literal, TypeAlias, get_args
 
-from gcar_deploy.config.ranges import Count, Length, Range, Scale, Share
+from gcar_deploy.config.ranges import Count, Range, Scale, Share
 
 Refiner: TypeAlias = Literal["tube", "paper", "none"]
 REFINERS = get_args(Refiner)
@@ -13,30 +13,6 @@ Backend: TypeAlias = Literal["numpy", "torch"]
 BACKENDS = get_args(Backend)
 Device: TypeAlias = Literal["cpu", "cuda"]
 DEVICES = get_args(Device)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TreeOptions:
-    """From points to a centreline graph."""
-
-    #: smoothing of the points' confidence before thresholding, lattice cells (sigma)
-    smooth_cells: Annotated[float, Range(0.05, 20)] = 0.6
-    #: hysteresis on the smoothed confidence: kept from ``low`` where connected to ``high``
-    low: Annotated[float, Range(1e-3, 1)] = 0.08
-    high: Annotated[float, Range(1e-3, 1)] = 0.25
-    #: a side branch must stick out of its parent by this many lattice cells
-    min_branch_cells: Length = 4.0
-    #: a component shorter than this is dropped, lattice cells
-    min_component_cells: Length = 8.0
-    #: gaps up to this long between a free end and another piece are bridged, lattice cells
-    max_gap_cells: Annotated[float, Range(0, 100)] = 5.0
-    #: distance between centreline points, lattice cells
-    step_cells: Annotated[float, Range(0.05, 20)] = 0.8
-    #: correlation length of the centreline's smoothing, lattice cells
-    curve_cells: Annotated[float, Range(0.01, 100)] = 2.0
-    #: radii outside are not believed, mm
-    min_radius_mm: Annotated[float, Range(0.01, 100)] = 0.25
-    max_radius_mm: Annotated[float, Range(0.01, 100)] = 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,30 +81,6 @@ class TubeOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class VolumeOptions:
-    """From fitted tubes to voxels: how far real sections may differ from round ones."""
-
-    #: correct the tubes' occupancy by pictures and starting points; else round tubes only
-    fuse: bool = True
-    #: standard deviation of a voxel half inside a tube, and of one far from its surface
-    surface_sigma: Annotated[float, Range(1e-3, 100)] = 0.3
-    floor_sigma: Annotated[float, Range(1e-3, 100)] = 0.03
-    #: how far such differences reach along a vessel and across it, voxels (sigma)
-    along_voxels: Annotated[float, Range(0.05, 100)] = 1.0
-    across_voxels: Annotated[float, Range(0.05, 100)] = 0.6
-    #: noise of the path length per pixel of about a voxel: constant part, share of the path
-    noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.3
-    noise_share: Annotated[float, Range(0, 100)] = 0.1
-    #: least noise of a lattice point's confidence; of scattered points: variance per occupancy
-    confidence_sigma: Annotated[float, Range(1e-3, 100)] = 0.08
-    scatter_variance: Annotated[float, Range(1e-3, 100)] = 0.25
-    #: points scattered more than this say nothing about single voxels, voxels (sigma)
-    max_scatter_voxels: Annotated[float, Range(0, 1000)] = 0.8
-    #: more voxels than this near a surface are left to the round tubes
-    max_cells: Count = 60_000
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class PaperOptions:
     """The paper's refinement: Gaussians, Adam, adaptive density control."""
 
@@ -174,4 +126,5 @@ class RefineOptions:
     refiner: Refiner = "tube"
     tube: TubeOptions = dataclasses.field(default_factory=TubeOptions)
     paper: PaperOptions = dataclasses.field(default_factory=PaperOptions)
-    volume: VolumeOptions = dataclasses.field(default_factory=VolumeOptions)
+    #: correct the tubes' occupancy by pictures and starting points; else round tubes only
+    fuse: bool = True

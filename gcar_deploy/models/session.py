@@ -64,7 +64,7 @@ class Session:
         """
         if self.model.golden is None:
             return None
-        return check_golden(self.model.name, self.model.golden, self._run, self.model.limits)
+        return check_golden(self.model.name, self.model.golden, self._run)
 
     def answers(self, feed: Mapping[str, Array]) -> dict[str, Array]:
         """Run the graph on named inputs; return its outputs by name, as they are."""

@@ -17,6 +17,7 @@ from gcar_deploy.models.golden import Golden, read_golden
 from gcar_deploy.models.guard import check_onnx
 
 SCHEMA = "gcar-model/1"
+_MAX_SPEC_BYTES = 64 * 2**10
 _PLACE = "gcar_models"
 
 
@@ -55,7 +56,6 @@ class ModelFile:
     sha256 : str of the ONNX file
     data : bytes of the ONNX file
     golden : Golden or None, a small case with its answer, where there is one beside the model
-    limits : ModelLimits it was read with
     """
 
     name: str
@@ -63,7 +63,6 @@ class ModelFile:
     sha256: str
     data: bytes = dataclasses.field(repr=False)
     golden: Golden | None = dataclasses.field(default=None, repr=False)
-    limits: ModelLimits = dataclasses.field(default_factory=ModelLimits, repr=False)
 
     @property
     def kind(self) -> str:
@@ -105,7 +104,7 @@ def read_model(path: Path, kinds: Sequence[Kind], limits: ModelLimits | None = N
     limits = limits or ModelLimits()
     spec_path = path.with_suffix(".json")
     data = _read("model file", path, limits.max_bytes)
-    spec = _spec(spec_path, limits)
+    spec = _spec(spec_path)
     digest = hashlib.sha256(data).hexdigest()
     if digest != spec.get("sha256"):
         raise ModelError(
@@ -123,7 +122,6 @@ def read_model(path: Path, kinds: Sequence[Kind], limits: ModelLimits | None = N
         sha256=digest,
         data=data,
         golden=read_golden(path, digest, limits),
-        limits=limits,
     )
 
 
@@ -152,8 +150,8 @@ def _read(what: str, path: Path, max_bytes: int) -> bytes:
         raise ModelError(f"{what} {path.name}: {error}") from None
 
 
-def _spec(path: Path, limits: ModelLimits) -> dict[str, Any]:
-    data = _read("model file", path, limits.max_spec_bytes)
+def _spec(path: Path) -> dict[str, Any]:
+    data = _read("model file", path, _MAX_SPEC_BYTES)
     try:
         spec = read_json(data.decode("utf-8"))
     except (UnicodeDecodeError, GeometryError):

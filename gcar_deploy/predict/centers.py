@@ -118,26 +118,24 @@ def find_centers(
         Cancelled or late.
     """
     if predictor is None:
-        thinned = thin_hull(seen.hull, seen.encoded, options.candidates)
+        thinned = thin_hull(seen.hull, seen.encoded)
         return Centers(thinned, findings=(_THINNED,))
     stop = watch.question
     if isinstance(predictor, SingleViewPredictor):
         alone = predictor.predict([(view.carm, view.path_mm) for view in seen.views], stop)
-        single = options.predict.single
-        merged = merge_views(alone, seen.hull, seen.encoded, options.candidates, single)
-        return Centers(merged)
+        return Centers(merge_views(alone, seen.hull, seen.encoded))
     told = predictor.predict(seen.hull, seen.encoded, stop)
     others = []
     for look in range(1, options.predict.looks):
         lattice = shifted_lattice(seen.hull.lattice, look)
-        near = near_evidence(seen.hull, told.confidence, look, options.predict.look_again)
+        near = near_evidence(seen.hull, told.confidence, look)
         paths = [(carm, path) for carm, path, _ in seen.sampled]
         other = visual_hull(paths, lattice, seen.candidates, near)
         if len(other):
             others.append((other, predictor.predict(other, encode(other, seen.sampled), stop)))
     told = mean_evidence(told, others)
     error = max(view.path_error for view in seen.views)
-    decided = decide(told, seen.encoded, error, options.decide)
+    decided = decide(told, seen.encoded, error)
     return Centers(decided, Evidence(told, seen.encoded.ray, seen.encoded.weight))
 
 
@@ -154,4 +152,4 @@ def quick_tree(
     if len(seen.hull) == 0:
         return empty_tree()
     once = dataclasses.replace(options, predict=dataclasses.replace(options.predict, looks=1))
-    return build_tree(find_centers(seen, predictor, once, watch).points, options.tree)
+    return build_tree(find_centers(seen, predictor, once, watch).points)

@@ -20,15 +20,20 @@ import numpy as np
 from scipy import sparse
 from scipy.special import expit, logit
 
-from gcar_deploy.config import DecideOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict.encoding import Encoded
 from gcar_deploy.types import Array, Scalars
 
+#: steps of the falling temperature, and its inverse reached at the last
+STEPS, FINAL_SHARPNESS = 24, 3.0
+#: J above, and m: how many of the 26 neighbours are support enough
+COUPLING, ENOUGH_NEIGHBOURS = 1.0, 3.0
+#: c above, how freely a ray may differ from its path length, cells squared per unit of evidence;
+#: and more by this times the square of the paths' relative error
+LOOSENESS, LOOSENESS_OF_ERROR = 0.5, 56.0
 
-def decide(
-    centers: CenterPoints, encoded: Encoded, path_error: float, options: DecideOptions
-) -> CenterPoints:
+
+def decide(centers: CenterPoints, encoded: Encoded, path_error: float) -> CenterPoints:
     """Sharpen the confidences of ``centers``; points, order and count stay as they are.
 
     Parameters
@@ -36,19 +41,16 @@ def decide(
     centers : CenterPoints, one per candidate of ``encoded``
     encoded : Encoded
     path_error : float, relative error of the paths; 0 only where they are true mm in every view
-    options : DecideOptions
     """
     evidence = logit(np.clip(centers.confidence, 1e-4, 1 - 1e-4))
-    views = _Rays.of(encoded, centers.confidence, path_error, options)
+    views = _Rays.of(encoded, centers.confidence, path_error)
     x = expit(evidence)
     neighbours = _adjacent(encoded.neighbours[0])
-    for step in range(options.steps):
-        share = step / max(options.steps - 1, 1)
-        beta = 1.0 + (options.final_sharpness - 1.0) * share
-        enough = (
-            np.minimum(neighbours @ x, options.enough_neighbours) - 0.5 * options.enough_neighbours
-        )
-        field = beta * (evidence + options.coupling * enough)
+    for step in range(STEPS):
+        share = step / max(STEPS - 1, 1)
+        beta = 1.0 + (FINAL_SHARPNESS - 1.0) * share
+        enough = np.minimum(neighbours @ x, ENOUGH_NEIGHBOURS) - 0.5 * ENOUGH_NEIGHBOURS
+        field = beta * (evidence + COUPLING * enough)
         x = 0.5 * (x + views.project(field, beta))
     return dataclasses.replace(centers, confidence=x)
 
@@ -74,7 +76,7 @@ class _Rays:
     looseness: float
 
     @staticmethod
-    def of(encoded: Encoded, expected: Scalars, path_error: float, options: DecideOptions) -> _Rays:
+    def of(encoded: Encoded, expected: Scalars, path_error: float) -> _Rays:
         path = []
         for ray, p, w in zip(encoded.ray, encoded.ray_path, encoded.weight, strict=True):
             # Padding rays behind no point have no say.
@@ -82,7 +84,7 @@ class _Rays:
             if path_error > 0:
                 seen = seen * np.clip((expected * w).sum() / max(seen.sum(), 1e-9), 0.25, 4.0)
             path.append(seen)
-        loose = options.looseness + options.looseness_of_error * path_error**2
+        loose = LOOSENESS + LOOSENESS_OF_ERROR * path_error**2
         weight = encoded.weight.astype(np.float64)
         return _Rays(encoded.ray, path, weight, [np.zeros(len(p)) for p in path], loose)
 

@@ -21,6 +21,9 @@ from gcar_deploy.types import Array, Scalars
 #: cells by which each lattice is shifted; the second fills the gaps of the first, and so on
 SHIFTS = ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.25, 0.5, 0.75), (0.75, 0.0, 0.25))
 
+#: after the first look only what lies near points of at least this confidence is asked again
+LOOK_AGAIN = 0.15
+
 
 def shifted_lattice(lattice: Grid, look: int) -> Grid:
     """Return ``lattice`` moved by its look's share of a cell; look 0 is the lattice itself."""
@@ -30,7 +33,7 @@ def shifted_lattice(lattice: Grid, look: int) -> Grid:
     return dataclasses.replace(lattice, center_mm=(float(x), float(y), float(z)))
 
 
-def near_evidence(first: Candidates, confidence: Scalars, look: int, least: float) -> Array:
+def near_evidence(first: Candidates, confidence: Scalars, look: int) -> Array:
     """Find the points of a later look within 1.5 cells (per axis) of what the first believed.
 
     Parameters
@@ -38,7 +41,6 @@ def near_evidence(first: Candidates, confidence: Scalars, look: int, least: floa
     first : Candidates (n) of look 0
     confidence : (n,) what the predictor said of them
     look : int
-    least : points of the first look below this confidence are not asked again
 
     Returns
     -------
@@ -47,7 +49,7 @@ def near_evidence(first: Candidates, confidence: Scalars, look: int, least: floa
     shape = np.asarray(first.lattice.shape)
     steps = [np.arange(np.ceil(-s - 1.5), np.floor(-s + 1.5) + 1) for s in SHIFTS[look]]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3).astype(np.int64)
-    believed = first.index[confidence >= least]
+    believed = first.index[confidence >= LOOK_AGAIN]
     index = (believed[:, None] + offsets).reshape(-1, 3)
     index = index[((index >= 0) & (index < shape)).all(axis=1)]
     marked = np.zeros(shape, bool)

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from gcar_deploy.config import CandidateOptions, SingleViewOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict.center_map import ViewCenters
 from gcar_deploy.predict.encoding import Encoded
@@ -27,13 +26,15 @@ from gcar_deploy.predict.hull import Candidates
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.types import Points, Scalars
 
+#: a depth off by so many pixel edges of the network's picture counts a quarter; the shipped model
+#: is off by some 9 (median, generated scenes)
+DEPTH_SCALE_PIXELS = 8.0
+
 
 def merge_views(
     views: Sequence[ViewCenters],
     candidates: Candidates,
     encoded: Encoded,
-    thinning: CandidateOptions,
-    options: SingleViewOptions,
 ) -> CenterPoints:
     """Turn the centres of single views into confidences of the hull's points.
 
@@ -49,12 +50,12 @@ def merge_views(
     """
     start = np.full(len(candidates), 0.5)
     for view in views:
-        start *= agreement(view, candidates.points_mm, options)
-    merged = thin_hull(candidates, encoded, thinning, start)
+        start *= agreement(view, candidates.points_mm)
+    merged = thin_hull(candidates, encoded, start)
     return dataclasses.replace(merged, source="single")
 
 
-def agreement(view: ViewCenters, points_mm: Points, options: SingleViewOptions) -> Scalars:
+def agreement(view: ViewCenters, points_mm: Points) -> Scalars:
     """How far a view's predicted depths speak for points, (n,), 0 .. 1; 1 where it says nothing.
 
     A point is compared with the predicted centre of the cell that it projects to, or of the
@@ -73,6 +74,6 @@ def agreement(view: ViewCenters, points_mm: Points, options: SingleViewOptions) 
     cell = np.clip(np.rint((pixels + 0.5) / view.alpha - 0.5), 0, m - 1).astype(np.int64)
     row, col = nearest[:, cell[:, 1], cell[:, 0]]
     wrong = np.linalg.norm(points_mm - source, axis=1) - distance[row, col]
-    off = wrong / (options.depth_scale_pixels * picture.pixel_mm)
+    off = wrong / (DEPTH_SCALE_PIXELS * picture.pixel_mm)
     out: Scalars = (1.0 + off**2) ** -2
     return out

@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcar_deploy.config import CandidateOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict.encoding import Encoded
 from gcar_deploy.predict.hull import Candidates
 from gcar_deploy.types import Array, Scalars
 
+#: passes over all views, and the power applied after each; above 1 weak shares give way to strong
+STEPS, SHARPNESS = 40, 1.05
+
 
 def thin_hull(
     candidates: Candidates,
     encoded: Encoded,
-    options: CandidateOptions,
     start: Scalars | None = None,
 ) -> CenterPoints:
     """Share the path of every ray among the hull points behind it.
@@ -34,10 +35,10 @@ def thin_hull(
     CenterPoints with the occupancy as confidence and no radius; ``source = "hull"``.
     """
     x = np.full(len(candidates), 0.5) if start is None else np.clip(start, 1e-6, 1.0)
-    for iteration in range(options.thinning_steps):
+    for iteration in range(STEPS):
         x = _explain(x, encoded)
-        if iteration < options.thinning_steps - 3:
-            x = _sharpen(_smooth(x, encoded.neighbours[0]), options.thinning_sharpness)
+        if iteration < STEPS - 3:
+            x = _smooth(x, encoded.neighbours[0]) ** SHARPNESS
     return CenterPoints(
         points_mm=candidates.points_mm,
         confidence=x,
@@ -62,7 +63,3 @@ def _smooth(x: Scalars, neighbours: Array) -> Scalars:
     around = padded[neighbours].sum(axis=1) - x
     # Two full neighbours, as along a thin vessel, are support enough.
     return x * (0.5 + 0.5 * np.minimum(around / 2.0, 1.0))
-
-
-def _sharpen(x: Scalars, power: float) -> Scalars:
-    return x**power

@@ -18,13 +18,22 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import TreeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.tree.curves import LEAST_CONFIDENCE, draw_branches
 from gcar_deploy.tree.raster import blurred, depth_of, hysteresis, peaks, splat, touching
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Points, Scalars
 
+#: smoothing of the points' confidence before thresholding, lattice cells (sigma)
+SMOOTH_CELLS = 0.6
+#: hysteresis on the smoothed confidence: kept from ``LOW`` where connected to ``HIGH``
+LOW, HIGH = 0.08, 0.25
+#: a side branch must stick out of its parent by this many lattice cells
+MIN_BRANCH_CELLS = 4.0
+#: a component shorter than this is dropped, lattice cells
+MIN_COMPONENT_CELLS = 8.0
+#: gaps up to this long between a free end and another piece are bridged, lattice cells
+MAX_GAP_CELLS = 5.0
 #: how strongly a path prefers the middle of a vessel to its rim.
 MIDDLE_PREFERENCE = 6.0
 #: cost of a bridged cell beside a cell of confident vessel.
@@ -60,7 +69,7 @@ class CellGraph:
     cell_mm: float
 
 
-def build_tree(centers: CenterPoints, options: TreeOptions | None = None) -> Tree:
+def build_tree(centers: CenterPoints) -> Tree:
     """Build the centreline tree of weighted points.
 
     Parameters
@@ -68,21 +77,19 @@ def build_tree(centers: CenterPoints, options: TreeOptions | None = None) -> Tre
     centers : CenterPoints
         ``confidence * spacing_mm**3`` is taken as vessel volume; ``radius_mm`` is used where
         it is finite.
-    options : TreeOptions
 
     Returns
     -------
     Tree, possibly with several components, possibly empty; sigma is NaN.
     """
-    options = options or TreeOptions()
     centers = usable_points(centers)
     if not len(centers):
         return empty_tree()
-    graph = cell_graph(centers, options)
+    graph = cell_graph(centers)
     if not len(graph.points_mm):
         return empty_tree()
-    paths = _paths(graph, options)
-    return draw_branches(graph.points_mm, paths, centers, options)
+    paths = _paths(graph)
+    return draw_branches(graph.points_mm, paths, centers)
 
 
 def usable_points(centers: CenterPoints) -> CenterPoints:
@@ -106,7 +113,7 @@ def usable_points(centers: CenterPoints) -> CenterPoints:
     return clean.select(keep)
 
 
-def cell_graph(centers: CenterPoints, options: TreeOptions) -> CellGraph:
+def cell_graph(centers: CenterPoints) -> CellGraph:
     """Rasterise, smooth, threshold and connect; see ``CellGraph``."""
     h = centers.spacing_mm
     # Aligned with the first point, so that lattice points fall on cell centres.
@@ -120,8 +127,8 @@ def cell_graph(centers: CenterPoints, options: TreeOptions) -> CellGraph:
     low = np.floor(at.min(axis=0)).astype(np.int64) - PAD
     shape = np.ceil(at.max(axis=0)).astype(np.int64) + PAD + 1 - low
     density = splat(at - low, centers.confidence, shape)
-    value = blurred(density, options.smooth_cells, 3.0)
-    mask = hysteresis(value, options.low, options.high)
+    value = blurred(density, SMOOTH_CELLS, 3.0)
+    mask = hysteresis(value, LOW, HIGH)
     cells = np.argwhere(mask)
     if not len(cells):
         return nothing
@@ -129,13 +136,13 @@ def cell_graph(centers: CenterPoints, options: TreeOptions) -> CellGraph:
     middle = blurred(np.minimum(density, 1.0), 1.5, 2.0)
     # How central each cell is: 1 where the middle peaks among the neighbours, else less.
     central = middle[pick].astype(np.float64) / np.maximum(peaks(middle)[pick], 1e-12)
-    cost, length = _steps(cells, mask.shape, central, options)
+    cost, length = _steps(cells, mask.shape, central)
     points = origin + (cells + low) * h
     return CellGraph(points, value[pick].astype(np.float64), depth_of(cells, mask), cost, length, h)
 
 
 def _steps(
-    cells: Array, shape: tuple[int, ...], central: Scalars, options: TreeOptions
+    cells: Array, shape: tuple[int, ...], central: Scalars
 ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
     """Link neighbours, and bridge between pieces."""
     n = len(cells)
@@ -144,7 +151,7 @@ def _steps(
     cost = length * np.exp(MIDDLE_PREFERENCE * off_middle)
     grid = sparse.csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     piece = csgraph.connected_components(grid, directed=False)[1]
-    bridges, gap = _bridges(cells, piece, options)
+    bridges, gap = _bridges(cells, piece)
     pairs = np.concatenate([pairs, bridges])
     length = np.concatenate([length, gap])
     cost = np.concatenate([cost, gap * BRIDGE_COST])
@@ -159,7 +166,7 @@ def _steps(
     return cost_of, length_of
 
 
-def _bridges(cells: Array, piece: Array, options: TreeOptions) -> tuple[Array, Scalars]:
+def _bridges(cells: Array, piece: Array) -> tuple[Array, Scalars]:
     """Shortest links between separate pieces, a spanning forest of them: (b, 2), (b,) cells."""
     found: list[tuple[float, int, int]] = []
     count = int(piece.max()) + 1
@@ -169,7 +176,7 @@ def _bridges(cells: Array, piece: Array, options: TreeOptions) -> tuple[Array, S
         for j in range(i + 1, count):
             small, large = (i, j) if len(members[i]) <= len(members[j]) else (j, i)
             d, at = trees[large].query(
-                cells[members[small]], distance_upper_bound=options.max_gap_cells + 1
+                cells[members[small]], distance_upper_bound=MAX_GAP_CELLS + 1
             )
             k = int(np.argmin(d))
             if np.isfinite(d[k]):
@@ -191,7 +198,7 @@ def _root(parent: list[int], i: int) -> int:
     return i
 
 
-def _paths(graph: CellGraph, options: TreeOptions) -> list[Array]:
+def _paths(graph: CellGraph) -> list[Array]:
     """Cell paths from each tip to the tree so far; a component's first path is root to tip."""
     count, label = csgraph.connected_components(graph.cost, directed=False)
     order = np.argsort(label, kind="stable")
@@ -209,9 +216,9 @@ def _paths(graph: CellGraph, options: TreeOptions) -> list[Array]:
     lookup = cKDTree(graph.points_mm)
     paths: list[Array] = []
     for member, root in zip(members, roots, strict=True):
-        if reach[member].max() >= options.min_component_cells:
+        if reach[member].max() >= MIN_COMPONENT_CELLS:
             tips = member[np.argsort(-reach[member], kind="stable")]
-            paths += _component_paths(graph, root, tips, before, covered, lookup, options)
+            paths += _component_paths(graph, root, tips, before, covered, lookup)
     return paths
 
 
@@ -222,7 +229,6 @@ def _component_paths(
     before: Array,
     covered: Array,
     lookup: cKDTree,
-    options: TreeOptions,
 ) -> list[Array]:
     """Join the tips, in their order, to the tree that starts with ``root``."""
     on_tree = {root}
@@ -238,7 +244,7 @@ def _component_paths(
         steps = (
             np.linalg.norm(np.diff(graph.points_mm[route], axis=0), axis=1).sum() / graph.cell_mm
         )
-        keep = not paths or steps - hidden >= options.min_branch_cells
+        keep = not paths or steps - hidden >= MIN_BRANCH_CELLS
         if keep:
             paths.append(route)
             on_tree.update(path)

@@ -8,18 +8,21 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import TreeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.tree.tree import Branch, Tree, along, empty_tree, polyline_arc
 from gcar_deploy.types import Array, Points, Scalars
 
+#: distance between centreline points, lattice cells
+STEP_CELLS = 0.8
+#: correlation length of the centreline's smoothing, lattice cells
+CURVE_CELLS = 2.0
+#: radii outside are not believed, mm
+MIN_RADIUS_MM, MAX_RADIUS_MM = 0.25, 4.0
 #: points with less confidence than this move no centroid and change no threshold's outcome
 LEAST_CONFIDENCE = 1e-6
 
 
-def draw_branches(
-    cells_mm: Points, paths: list[Array], centers: CenterPoints, options: TreeOptions
-) -> Tree:
+def draw_branches(cells_mm: Points, paths: list[Array], centers: CenterPoints) -> Tree:
     """Turn paths over cells (tip first, junction or root last) into a smooth tree.
 
     Parameters
@@ -27,7 +30,6 @@ def draw_branches(
     cells_mm : (n, 3) mm
     paths : list of (m,) cell indices; a later path ends on a cell of an earlier one
     centers : CenterPoints, for centroid and cross-section area
-    options : TreeOptions
     """
     if not paths:
         return empty_tree()
@@ -35,12 +37,12 @@ def draw_branches(
     keys = sorted({int(end) for piece in pieces for end in (piece[0], piece[-1])})
     number = {key: i for i, key in enumerate(keys)}
     nodes = cells_mm[np.array(keys, dtype=np.int64)] if keys else np.zeros((0, 3))
-    step = options.step_cells * centers.spacing_mm
+    step = STEP_CELLS * centers.spacing_mm
     lines = [resample(cells_mm[piece], step) for piece in pieces]
     ends = np.array([[number[int(p[0])], number[int(p[-1])]] for p in pieces]).reshape(-1, 2)
-    lines, nodes = _recentre(lines, ends, nodes, centers, options)
+    lines, nodes = _recentre(lines, ends, nodes, centers)
     lines = [resample(line, step) for line in lines]
-    radii, confidence = _radii(lines, centers, options)
+    radii, confidence = _radii(lines, centers)
     branches = tuple(
         Branch(
             points_mm=line,
@@ -92,10 +94,10 @@ def _split(paths: list[Array]) -> list[Array]:
 
 
 def _recentre(
-    lines: list[Points], ends: Array, nodes: Points, centers: CenterPoints, options: TreeOptions
+    lines: list[Points], ends: Array, nodes: Points, centers: CenterPoints
 ) -> tuple[list[Points], Points]:
     """Draw each point to the centroid of the points nearest to it, then smooth."""
-    sigma = options.curve_cells / options.step_cells
+    sigma = CURVE_CELLS / STEP_CELLS
     for _ in range(2):
         allpoints = np.concatenate(lines)
         centroid, mass = _centroids(allpoints, centers)
@@ -157,12 +159,10 @@ def _pinned(line: Points, first: Points, last: Points) -> Points:
     return out
 
 
-def _radii(
-    lines: list[Points], centers: CenterPoints, options: TreeOptions
-) -> tuple[list[Scalars], list[Scalars]]:
+def _radii(lines: list[Points], centers: CenterPoints) -> tuple[list[Scalars], list[Scalars]]:
     """Radius from the volume of the points that each stretch of line stands for."""
     points = np.concatenate(lines)
-    reach = max(4.0 * centers.spacing_mm, options.max_radius_mm)
+    reach = max(4.0 * centers.spacing_mm, MAX_RADIUS_MM)
     near, nearest = _nearest(points, centers.points_mm, reach)
     weight = centers.confidence * near
     volume = np.bincount(nearest, weight, minlength=len(points)) * centers.spacing_mm**3
@@ -182,13 +182,13 @@ def _radii(
         use = np.ones(len(line))
         if len(line) > 4:
             use[[0, -1]] = 0.0
-        sigma = 1.5 / options.step_cells
+        sigma = 1.5 / STEP_CELLS
         area = _blur(volume[part] * use, sigma) / np.maximum(_blur(own * use, sigma), 1e-9)
         radius = np.sqrt(np.maximum(area, 0) / np.pi)
         share = _blur(told_mass[part], sigma)
         spoken = _blur(told[part], sigma) / np.maximum(share, 1e-9)
         radius = np.where(share > 1e-6, spoken, radius)
-        radii.append(np.clip(radius, options.min_radius_mm, options.max_radius_mm))
+        radii.append(np.clip(radius, MIN_RADIUS_MM, MAX_RADIUS_MM))
         trust.append(
             _blur(volume[part], sigma)
             / np.maximum(_blur(count[part], sigma) * centers.spacing_mm**3, 1e-9)

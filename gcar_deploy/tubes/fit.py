@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy.config import TreeOptions, TubeOptions
+from gcar_deploy.config import TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.centerline import build_tree, usable_points
@@ -61,7 +61,6 @@ def fit_tubes(
     centers: CenterPoints,
     views: Sequence[VesselImage],
     options: TubeOptions,
-    tree_options: TreeOptions | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TubeFit:
     """Fit a tube tree to the pictures from starting points.
@@ -70,7 +69,7 @@ def fit_tubes(
     ----------
     centers : CenterPoints
     views : sequence of VesselImage, one or more
-    options, tree_options : frozen options
+    options : TubeOptions
     should_stop : callable, asked before each step; True ends the fit with the best so far
     """
     progress = Progress()
@@ -80,7 +79,7 @@ def fit_tubes(
     if should_stop is not None:
         # Whoever cancelled raises here; a deadline is heeded by the first step.
         should_stop()
-    tree = build_tree(settled_centers, tree_options)
+    tree = build_tree(settled_centers)
     fit = TubeFit(
         tree=tree,
         centers=settled_centers,

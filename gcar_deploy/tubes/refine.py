@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy.config import REFINERS, RefineOptions, TreeOptions
+from gcar_deploy.config import REFINERS, RefineOptions
 from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -17,6 +17,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.stopwatch import Budget
 from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gaussians import strung_gaussians
@@ -79,8 +80,6 @@ def refine(
     options: RefineOptions | None = None,
     on_progress: OnProgress | None = None,
     budget: Budget | None = None,
-    *,
-    tree_options: TreeOptions | None = None,
 ) -> Refined:
     """Refine starting points so that the model's projections explain every view.
 
@@ -91,7 +90,6 @@ def refine(
     options : RefineOptions; ``refiner`` picks the method
     on_progress : called with the share done, 0 .. 1
     budget : Budget; all the time where left out
-    tree_options : TreeOptions for the refiners that build a tree
 
     Raises
     ------
@@ -104,13 +102,13 @@ def refine(
         raise UsageError("refinement needs at least one view")
     budget = budget or Budget()
     if not budget.enough or options.refiner != "tube":
-        start = _unrefined(centers, len(views), tree_options)
+        start = _unrefined(centers, len(views))
         if not budget.enough:
             return dataclasses.replace(start, status="late")
         if options.refiner == "none":
             return start
         return _paper(start, views, options, on_progress, budget.should_stop)
-    fit = fit_tubes(centers, views, options.tube, tree_options, budget.should_stop)
+    fit = fit_tubes(centers, views, options.tube, budget.should_stop)
     if on_progress is not None:
         on_progress(1.0)
     status = "ok" if fit.tree.branches else "empty"
@@ -137,6 +135,8 @@ def refined_volume(
     options = options or RefineOptions()
     if refined.refiner == "paper":
         return np.clip(voxelize(refined.gaussians, grid), 0.0, 1.0)
+    if not options.fuse:
+        return tree_occupancy(refined.tree, grid)
     if refined.refiner == "none":
         views = ()
     return tube_volume(
@@ -146,14 +146,13 @@ def refined_volume(
         refined.contrast[: len(views)],
         refined.centers,
         options.tube.edge_blur_mm,
-        options.volume,
         refined.model_mm,
     )
 
 
-def _unrefined(centers: CenterPoints, views: int, tree_options: TreeOptions | None) -> Refined:
+def _unrefined(centers: CenterPoints, views: int) -> Refined:
     """Tree and Gaussians straight from the points."""
-    tree = build_tree(centers, tree_options)
+    tree = build_tree(centers)
     return Refined(
         refiner="none",
         gaussians=strung_gaussians(tree),

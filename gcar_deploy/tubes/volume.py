@@ -20,7 +20,6 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import VolumeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import separation_deg
 from gcar_deploy.geometry.grid import Grid
@@ -33,6 +32,18 @@ from gcar_deploy.tubes.settle import scatter_is_none
 from gcar_deploy.tubes.splat import cell_view, shrunk
 from gcar_deploy.types import Array, Points, Scalars, Volume
 
+#: standard deviation of a voxel half inside a tube, and of one far from its surface
+SURFACE_SIGMA, FLOOR_SIGMA = 0.3, 0.03
+#: how far such differences reach along a vessel and across it, voxels (sigma)
+ALONG_VOXELS, ACROSS_VOXELS = 1.0, 0.6
+#: noise of the path length per pixel of about a voxel: constant part, share of the path
+NOISE_MM, NOISE_SHARE = 0.3, 0.1
+#: least noise of a lattice point's confidence; of scattered points: variance per occupancy
+CONFIDENCE_SIGMA, SCATTER_VARIANCE = 0.08, 0.25
+#: points scattered more than this say nothing about single voxels, voxels (sigma)
+MAX_SCATTER_VOXELS = 0.8
+#: more voxels than this near a surface are left to the round tubes
+MOST_VOXELS = 60_000
 #: voxels are free where the slightly blurred tubes reach this occupancy.
 BAND = 0.02
 BAND_BLUR = 0.6
@@ -89,7 +100,6 @@ def tube_volume(
     contrast: Sequence[float],
     centers: CenterPoints | None,
     edge_blur_mm: float,
-    options: VolumeOptions,
     model_mm: Sequence[Array] = (),
 ) -> Volume:
     """Occupancy of each voxel, 0 .. 1.
@@ -102,7 +112,6 @@ def tube_volume(
     contrast : per view, factor of the picture's path on the model's
     centers : the points the fit started from, or None
     edge_blur_mm : as in the fit
-    options : VolumeOptions
     model_mm : per view (rows, cols) path of the tubes where the fit has it already, or empty
 
     Returns
@@ -111,25 +120,25 @@ def tube_volume(
     """
     volume = tree_occupancy(tree, grid)
     spacing = grid.spacing_mm
-    if not options.fuse or not tree.branches or spacing.max() / spacing.min() > MAX_ANISOTROPY:
+    if not tree.branches or spacing.max() / spacing.min() > MAX_ANISOTROPY:
         return volume
     near = _box_round(volume)
     if near is None:
         return volume
     inner = volume[near]
     blurred = ndimage.gaussian_filter(inner, BAND_BLUR, truncate=3.0)
-    if np.count_nonzero(blurred > BAND) > options.max_cells:
+    if np.count_nonzero(blurred > BAND) > MOST_VOXELS:
         return volume
-    band = _band(inner, blurred, grid, np.array([part.start for part in near]), options)
+    band = _band(inner, blurred, grid, np.array([part.start for part in near]))
     if not len(band.index):
         return volume
-    G = _correlation(band, tree, options)
+    G = _correlation(band, tree)
     operators, errors, variances = _pictures(
-        band, tree, grid, views, contrast, edge_blur_mm, options, model_mm
+        band, tree, grid, views, contrast, edge_blur_mm, model_mm
     )
     centers = None if centers is None else usable_points(centers)
     if centers is not None and len(centers):
-        told = _points(band, tree, grid, centers, len(views), options)
+        told = _points(band, tree, grid, centers, len(views))
         if told is not None:
             operators.append(told[0])
             errors.append(told[1])
@@ -156,9 +165,7 @@ def _box_round(volume: Volume) -> tuple[slice, ...] | None:
     return tuple(out)
 
 
-def _band(
-    volume: Volume, blurred: Array, grid: Grid, corner: Array, options: VolumeOptions
-) -> _Band:
+def _band(volume: Volume, blurred: Array, grid: Grid, corner: Array) -> _Band:
     """Voxels near the surface in a box of the grid whose first voxel is ``corner``."""
     near = blurred > BAND
     index = np.argwhere(near)
@@ -173,7 +180,7 @@ def _band(
     found = lookup[flat[:, None] + offsets @ stride]
     free = found >= 0
     half = np.clip(blurred[near].astype(np.float64), 0.0, 1.0)
-    sigma2 = options.floor_sigma**2 + options.surface_sigma**2 * 4 * half * (1 - half)
+    sigma2 = FLOOR_SIGMA**2 + SURFACE_SIGMA**2 * 4 * half * (1 - half)
     index += corner
     return _Band(
         index=index,
@@ -186,15 +193,13 @@ def _band(
     )
 
 
-def _correlation(band: _Band, tree: Tree, options: VolumeOptions) -> sparse.csr_matrix:
+def _correlation(band: _Band, tree: Tree) -> sparse.csr_matrix:
     """G with G G^T the prior covariance: Gaussian along and across the nearest vessel."""
     tangents = np.concatenate([branch.tangents for branch in tree.branches])
     nearest = cKDTree(tree.points()).query(band.points_mm)[1]
     along = tangents[nearest] @ band.offsets.T
     across2 = np.maximum(np.einsum("ij,ij->i", band.offsets, band.offsets) - along**2, 0.0)
-    weight = np.exp(
-        -0.5 * ((along / options.along_voxels) ** 2 + across2 / options.across_voxels**2)
-    )
+    weight = np.exp(-0.5 * ((along / ALONG_VOXELS) ** 2 + across2 / ACROSS_VOXELS**2))
     weight *= band.free
     weight *= (band.sigma / np.sqrt(np.einsum("ij,ij->i", weight, weight)))[:, None]
     return band.matrix(weight)
@@ -207,7 +212,6 @@ def _pictures(
     views: Sequence[VesselImage],
     contrast: Sequence[float],
     edge_blur_mm: float,
-    options: VolumeOptions,
     model_mm: Sequence[Array],
 ) -> tuple[list[sparse.csr_matrix], list[Scalars], list[Scalars]]:
     """Projector, path that the tubes leave unexplained, and its variance, per view."""
@@ -231,7 +235,7 @@ def _pictures(
         operators.append(cells.matrix)
         errors.append(rest.reshape(-1)[cells.pixel].astype(np.float64))
         path = cells.path_mm.reshape(-1)[cells.pixel].astype(np.float64)
-        variances.append(alike[k] * (options.noise_mm + options.noise_share * path) ** 2)
+        variances.append(alike[k] * (NOISE_MM + NOISE_SHARE * path) ** 2)
     return operators, errors, variances
 
 
@@ -245,7 +249,7 @@ def _alike(views: Sequence[VesselImage]) -> Scalars:
 
 
 def _points(
-    band: _Band, tree: Tree, grid: Grid, centers: CenterPoints, views: int, options: VolumeOptions
+    band: _Band, tree: Tree, grid: Grid, centers: CenterPoints, views: int
 ) -> tuple[sparse.csr_matrix, Scalars, Scalars] | None:
     """Read what the starting points say of the voxels; None where they are too coarse."""
     h = float(grid.spacing_mm.mean())
@@ -257,14 +261,14 @@ def _points(
     at = grid.world2index(centers.points_mm)
     if scatter_is_none(centers) and np.abs(at - np.rint(at)).max() < 0.02:
         error = density - band.mean
-        rim = band.sigma > 0.5 * options.surface_sigma
+        rim = band.sigma > 0.5 * SURFACE_SIGMA
         spread = float(np.mean(error[rim] ** 2)) if rim.any() else 0.0
         few = 2 / max(views, 2)
         tubes = TUBE_ERROR**2 * (LASTING_SHARE + (1 - LASTING_SHARE) * few)
-        noise = options.confidence_sigma**2 + BIAS_WEIGHT * few * max(spread - tubes, 0.0)
+        noise = CONFIDENCE_SIGMA**2 + BIAS_WEIGHT * few * max(spread - tubes, 0.0)
         return sparse.eye(n, format="csr"), error, np.full(n, noise)
     sigma = scatter_voxels(tree, centers)
-    if sigma > options.max_scatter_voxels:
+    if sigma > MAX_SCATTER_VOXELS:
         return None
     # Trilinear deposit adds the variance of its tent, 1/6.
     width2 = sigma**2 + 1 / 6
@@ -273,7 +277,7 @@ def _points(
     expected = K @ band.mean
     # Dropped points lower the whole density: compare shapes only.
     scale = float(density.sum() / max(expected.sum(), 1e-9))
-    variance = 0.01 + options.scatter_variance * np.maximum(expected, 0.02)
+    variance = 0.01 + SCATTER_VARIANCE * np.maximum(expected, 0.02)
     return K, density / max(scale, 1e-9) - expected, variance
 
 

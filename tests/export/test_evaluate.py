@@ -268,7 +268,7 @@ def test_rows_depend_on_their_own_settings_alone():
     assert other.run_options("hull+paper").refine.paper.steps == 7
     assert plain.run_options("single+paper-noloss").refine.paper.alpha == 1.0
     assert not plain.run_options("ours-nopose").pose.enabled
-    assert not plain.run_options("ours-round").refine.volume.fuse
+    assert not plain.run_options("ours-round").refine.fuse
     assert plain.run_options("ours-classic").imaging.segmenter == "classic"
     assert plain.run_options("multi+tube") != plain.run_options("ours-round")
     assert set(DESCRIPTIONS) == set(METHODS)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcar_deploy.config import CandidateOptions, DecideOptions
+from gcar_deploy.config import CandidateOptions
 from gcar_deploy.errors import ModelError, NumericalError
 from gcar_deploy.predict.center_predictor import CenterPredictor
 from gcar_deploy.predict.decision import decide
@@ -138,9 +138,7 @@ def test_decision_explains_rays_and_prefers_the_likelier(calibrated):
     rng = np.random.default_rng(0)
     hedged = np.clip(0.06 + 0.45 * truth + 0.12 * rng.normal(size=len(truth)), 0.02, 0.98)
     centers = CenterPredictor(read_predictor(TINY)).predict(hull, encoded)
-    decided = decide(
-        replace(centers, confidence=hedged), encoded, 0.0 if calibrated else 0.25, DecideOptions()
-    )
+    decided = decide(replace(centers, confidence=hedged), encoded, 0.0 if calibrated else 0.25)
 
     def dice(x):
         a, b = x >= 0.5, truth >= 0.5

@@ -94,7 +94,7 @@ def test_thinning_explains_every_pixel_once():
     views = scene()
     hull = visual_hull(views, GRID, CandidateOptions())
     e = encode(hull, [(c, p, True) for c, p in views])
-    centers = thin_hull(hull, e, CandidateOptions())
+    centers = thin_hull(hull, e)
     assert ((centers.confidence >= 0) & (centers.confidence <= 1)).all()
     for ray, path, weight in zip(e.ray, e.ray_path, e.weight, strict=True):
         made = np.bincount(ray, centers.confidence * weight, minlength=len(path))

@@ -63,11 +63,11 @@ def test_only_what_lies_near_evidence_is_asked_again(look):
     first = candidates(GRID)
     confidence = np.zeros(len(first))
     confidence[first.index.tolist().index([5, 6, 7])] = 0.9
-    near = near_evidence(first, confidence, look, 0.15)
+    near = near_evidence(first, confidence, look)
     gap = near + np.array(SHIFTS[look]) - [5, 6, 7]
     assert len(near) >= 27 and np.abs(gap).max() <= 1.5
     assert len(np.unique(near, axis=0)) == len(near)
-    assert len(near_evidence(first, 0 * confidence, look, 0.15)) == 0
+    assert len(near_evidence(first, 0 * confidence, look)) == 0
 
 
 def test_nothing_believed_halves_what_one_look_said():

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from gcar_deploy import Engine, RunOptions
-from gcar_deploy.config import CandidateOptions, PredictOptions, SingleViewOptions
+from gcar_deploy.config import CandidateOptions, PredictOptions
 from gcar_deploy.errors import ModelError, NumericalError
 from gcar_deploy.predict.center_map import decode, encode_depth, net_picture
 from gcar_deploy.predict.center_predictor import SingleViewPredictor, open_predictor
 from gcar_deploy.predict.encoding import encode
 from gcar_deploy.predict.hull import visual_hull
 from gcar_deploy.predict.kinds import read_predictor
-from gcar_deploy.predict.single_view import agreement, merge_views
+from gcar_deploy.predict.single_view import DEPTH_SCALE_PIXELS, agreement, merge_views
 from gcar_deploy.selftest import tiny_case
 
 pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
@@ -65,25 +65,23 @@ def test_true_depths_decide_and_wrong_ones_by_centimetres_still_help(hull):
     from gcar_deploy.predict.thinning import thin_hull
 
     views, found, encoded, truth = hull
-    options = CandidateOptions()
-    without = dice(thin_hull(found, encoded, options).confidence, truth)
-    merged = merge_views(true_centers(views), found, encoded, options, SingleViewOptions())
+    without = dice(thin_hull(found, encoded).confidence, truth)
+    merged = merge_views(true_centers(views), found, encoded)
     assert merged.source == "single" and len(merged) == len(found)
     assert dice(merged.confidence, truth) > without + 0.3
     noisy = true_centers(views, 5.0, np.random.default_rng(0))
-    rough = merge_views(noisy, found, encoded, options, SingleViewOptions())
+    rough = merge_views(noisy, found, encoded)
     assert dice(rough.confidence, truth) > without
 
 
 def test_agreement_is_one_at_the_predicted_depth_and_a_quarter_at_the_scale(hull):
     views, _, _, _ = hull
     center = true_centers(views)[0]
-    options = SingleViewOptions(depth_scale_pixels=6.0)
-    np.testing.assert_allclose(agreement(center, center.points_mm, options), 1.0, atol=1e-9)
+    np.testing.assert_allclose(agreement(center, center.points_mm), 1.0, atol=1e-9)
     source = center.picture.carm.source_mm
     ray = (center.points_mm - source) / np.linalg.norm(center.points_mm - source, axis=1)[:, None]
-    moved = center.points_mm + 6.0 * center.picture.pixel_mm * ray
-    np.testing.assert_allclose(agreement(center, moved, options), 0.25, atol=1e-9)
+    moved = center.points_mm + DEPTH_SCALE_PIXELS * center.picture.pixel_mm * ray
+    np.testing.assert_allclose(agreement(center, moved), 0.25, atol=1e-9)
 
 
 def test_a_view_that_says_nothing_changes_nothing(hull):
@@ -92,7 +90,7 @@ def test_a_view_that_says_nothing_changes_nothing(hull):
     none = dataclasses.replace(
         center, points_mm=np.zeros((0, 3)), ray_mm=np.zeros(0), cell=np.zeros((0, 2), int)
     )
-    np.testing.assert_array_equal(agreement(none, found.points_mm, SingleViewOptions()), 1.0)
+    np.testing.assert_array_equal(agreement(none, found.points_mm), 1.0)
 
 
 def test_one_set_of_centres_per_view_of_any_size():

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import TubeOptions, VolumeOptions
+from gcar_deploy.config import TubeOptions
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.model import footprint, tubes_of
@@ -87,10 +87,10 @@ def test_a_view_given_twice_tells_the_volume_nothing_new():
     ]
 
     def volume(times):
-        given = (views * times, (1.0,) * 2 * times, None, OPTIONS.edge_blur_mm, VolumeOptions())
+        given = (views * times, (1.0,) * 2 * times, None, OPTIONS.edge_blur_mm)
         return tube_volume(tree, where, *given, model * times)
 
-    round_only = tube_volume(tree, where, (), (), None, OPTIONS.edge_blur_mm, VolumeOptions())
+    round_only = tube_volume(tree, where, (), (), None, OPTIONS.edge_blur_mm)
     once, thrice = volume(1), volume(3)
     assert np.abs(once - round_only).max() > 0.1
     np.testing.assert_allclose(thrice, once, atol=0.01)
