@@ -91,7 +91,7 @@ def test_every_number_has_its_range_and_every_default_lies_in_it():
         ("pose.enabled", 1, "pose.enabled = 1 must be True or False"),
         ("predict", None, "predict = None must be PredictOptions"),
         ("predict.predictor", 7, "predictor = 7 must be one of auto, multi, single, none"),
-        ("imaging.segmenter", "Net", "segmenter = 'Net' must be one of classic, net, auto"),
+        ("imaging.segmenter", "Net", "segmenter = 'Net' must be one of auto, classic, net"),
     ],
 )
 def test_the_message_names_option_value_and_range(path, value, said, tmp_path):

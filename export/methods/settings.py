@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.config import PaperOptions, RunOptions
+from gcar_deploy.config import PaperOptions, PredictorName, RefinerName, RunOptions, SegmenterName
 from gcar_deploy.errors import UsageError
 from gcar_export.methods.fdk import FdkOptions
 from gcar_export.methods.nerp import NerpOptions
@@ -32,13 +32,13 @@ class RuntimeRow:
     fused : False leaves the tubes round: no correction of the volume by pictures and points
     """
 
-    predictor: str | None = None
-    refiner: str | None = None
+    predictor: PredictorName | None = None
+    refiner: RefinerName | None = None
     centreline_loss: bool = True
     swapped: bool = False
     pose: bool = True
     fused: bool = True
-    segmenter: str | None = None
+    segmenter: SegmenterName | None = None
 
 
 #: what the runtime does when asked for nothing in particular.

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import RunOptions
 from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor, open_predictor
 from gcar_deploy.predict.decision import decide
@@ -71,9 +70,8 @@ def scores(confidence: Array, scene: TrainingScene) -> tuple[float, float, float
 
 def measured(name: str, predictor: CenterPredictor, scene: TrainingScene) -> Row:
     """Run one model on one scene."""
-    options = RunOptions()
     found = predictor.predict(scene.hull, scene.encoded)
-    decided = decide(found, scene.encoded, scene.path_error, options.decide)
+    decided = decide(found, scene.encoded, scene.path_error)
     return Row(
         name,
         scene.kind.split("-")[1],

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gcar_deploy.config import RefineOptions, RunOptions
+from gcar_deploy.config import RefineOptions, RefinerName, RunOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
@@ -42,7 +42,12 @@ from gcar_export.scenes.raycast import as_label, raycast
 NOISES = (0.0, 0.5, 1.0, 2.0)
 DROPPED = 0.1
 #: rows of the table: refiner, and whether the loss has its centreline part
-MODES = (("tube", False), ("tube", True), ("paper", False), ("paper", True))
+MODES: tuple[tuple[RefinerName, bool], ...] = (
+    ("tube", False),
+    ("tube", True),
+    ("paper", False),
+    ("paper", True),
+)
 #: name in a row -> heading
 MEASURES = {
     "dsc": "volume DSC(0.5) %",
@@ -85,7 +90,7 @@ class Row:
 
     protocol: str
     case: str
-    refiner: str
+    refiner: RefinerName
     centreline: bool
     noise: float
     measures: Mapping[str, float | None]
@@ -113,7 +118,7 @@ def start_points(truth: Volume, grid: Grid, noise_voxels: float, seed: int) -> C
     )
 
 
-def mode_options(refiner: str, centreline: bool) -> RefineOptions:
+def mode_options(refiner: RefinerName, centreline: bool) -> RefineOptions:
     """Options of one row; the paper's loss is half centreline where it has that part."""
     options = RefineOptions(refiner=refiner)
     share = 1.0 - options.paper.alpha if centreline else 0.0
@@ -134,7 +139,7 @@ def subject_of(case: Case) -> Subject:
     )
 
 
-def one_fit(subject: Subject, noise: float, mode: tuple[str, bool]) -> Row:
+def one_fit(subject: Subject, noise: float, mode: tuple[RefinerName, bool]) -> Row:
     """Refine one start in one mode and score it; seconds are process CPU seconds."""
     case, options = subject.case, mode_options(*mode)
     centers = start_points(case.truth, case.grid, noise, seed=0)
@@ -171,7 +176,7 @@ def measured(subject: Subject, volume: Volume) -> dict[str, float | None]:
     }
 
 
-def digest(mode: tuple[str, bool]) -> str:
+def digest(mode: tuple[RefinerName, bool]) -> str:
     """First letters of the SHA-256 of a mode's options: a row with another one is out of date."""
     text = json.dumps(dataclasses.asdict(mode_options(*mode)), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -231,7 +236,7 @@ def table(rows: Sequence[Row], protocol: str) -> str:
     return "\n\n".join(parts)
 
 
-def _cell(rows: Sequence[Row], mode: tuple[str, bool], noise: float, name: str) -> str:
+def _cell(rows: Sequence[Row], mode: tuple[RefinerName, bool], noise: float, name: str) -> str:
     found = _by_case(rows, mode, noise, name)
     if not found:
         return "-"
@@ -243,7 +248,7 @@ def _cell(rows: Sequence[Row], mode: tuple[str, bool], noise: float, name: str) 
 
 
 def _by_case(
-    rows: Sequence[Row], mode: tuple[str, bool], noise: float, name: str
+    rows: Sequence[Row], mode: tuple[RefinerName, bool], noise: float, name: str
 ) -> dict[str, float]:
     return {
         row.case: value
@@ -264,11 +269,11 @@ def _stars(pairs: Sequence[tuple[float, float]]) -> str:
     return next((stars for level, stars in STARS if p < level), "")
 
 
-def _name(mode: tuple[str, bool]) -> str:
+def _name(mode: tuple[RefinerName, bool]) -> str:
     return mode[0] + ("-line" if mode[1] else "")
 
 
-def _kept(file: Path | None, mode: tuple[str, bool]) -> Row | None:
+def _kept(file: Path | None, mode: tuple[RefinerName, bool]) -> Row | None:
     if file is None or not file.is_file():
         return None
     row = Row(**json.loads(file.read_text(encoding="utf-8")))

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions
+from gcar_deploy.config import ImagingOptions, SegmenterName
 from gcar_deploy.errors import ModelError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
@@ -67,7 +67,7 @@ def network(path: Path | None) -> Segmenter:
 
 
 def expert_score(
-    truth_path: Path, net: Segmenter | None = None, who: str = "auto"
+    truth_path: Path, net: Segmenter | None = None, who: SegmenterName = "auto"
 ) -> tuple[dict[str, float], VesselImage]:
     """Score one expert-masked picture; ``who`` finds the vessels, with ``net`` where given."""
     truth = read_picture(truth_path)[0] > 127
@@ -96,7 +96,7 @@ def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
 
 
 def case_scores(
-    cases: Path, net: Segmenter | None = None, who: str = "auto"
+    cases: Path, net: Segmenter | None = None, who: SegmenterName = "auto"
 ) -> Iterator[tuple[str, dict[str, float], VesselImage, Image]]:
     """Score each view of each ``R_*`` case against the path lengths of its ``C_*`` case."""
     for raw in sorted(cases.glob("R_*")):
@@ -132,7 +132,9 @@ def path_scores(path_mm: Image, truth_mm: Image) -> dict[str, float]:
     }
 
 
-def _print_expert(pairs: Sequence[Path], each: bool, net: Segmenter | None, who: str) -> None:
+def _print_expert(
+    pairs: Sequence[Path], each: bool, net: Segmenter | None, who: SegmenterName
+) -> None:
     rows = {path.name.replace("_gt.png", ""): expert_score(path, net, who)[0] for path in pairs}
     names = list(next(iter(rows.values())))
     print(
@@ -159,7 +161,7 @@ def _numbered(rows: dict[str, dict[str, float]], rest: int) -> dict[str, dict[st
     return {name: r for name, r in rows.items() if name.isdigit() and int(name) % 2 == rest}
 
 
-def _print_cases(cases: Path, net: Segmenter | None, who: str) -> None:
+def _print_cases(cases: Path, net: Segmenter | None, who: SegmenterName) -> None:
     heading = True
     for name, scores, _, _ in case_scores(cases, net, who):
         if heading:

@@ -15,11 +15,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import RunOptions, TubeOptions
+from gcar_deploy.config import PredictorName, RunOptions, TubeOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
@@ -115,7 +116,8 @@ def calibrate_parts(
     """
     options = RunOptions()
     options = dataclasses.replace(
-        options, predict=dataclasses.replace(options.predict, predictor=predictor)
+        options,
+        predict=dataclasses.replace(options.predict, predictor=cast(PredictorName, predictor)),
     )
     engine = Engine(options=options)
     errors, sigmas, refused = [], [], 0

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import Predictor, Refiner, RunOptions
+from gcar_deploy.config import PredictorName, RefinerName, RunOptions
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
@@ -63,8 +63,8 @@ class BenchCase:
 class Cell:
     """One setting. ``gaussians`` is a cap for the paper's refiner, None elsewhere."""
 
-    predictor: Predictor
-    refiner: Refiner
+    predictor: PredictorName
+    refiner: RefinerName
     iterations: int
     gaussians: int | None
     pixels: int
@@ -104,7 +104,7 @@ class Row:
 def cells(quick: bool) -> list[Cell]:
     """Return the grid; what a refiner has no use for is not varied."""
     sides = (128, 512) if quick else (128, 256, 512)
-    varied: tuple[tuple[Refiner, tuple[int, ...], tuple[int | None, ...]], ...] = (
+    varied: tuple[tuple[RefinerName, tuple[int, ...], tuple[int | None, ...]], ...] = (
         ("none", (0,), (None,)),
         ("tube", (1, 6) if quick else (1, 2, 4, 6, 12), (None,)),
         ("paper", (25,) if quick else (25, 50, 150), (300,) if quick else (100, 300, 1000, 3000)),

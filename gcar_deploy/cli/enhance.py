@@ -10,7 +10,8 @@ import click
 
 from gcar_deploy.cli.common import gathered
 from gcar_deploy.cli.request import order_options
-from gcar_deploy.inputs.order import SEGMENTERS, Order
+from gcar_deploy.config import SEGMENTERS
+from gcar_deploy.inputs.order import Order
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,16 +10,8 @@ from typing import Any, TypeAlias, TypeVar
 
 import click
 
-from gcar_deploy.config import RunOptions
-from gcar_deploy.inputs.order import (
-    MOST_VIEWS,
-    POSES,
-    PREDICTORS,
-    REFINERS,
-    SEGMENTERS,
-    Order,
-    load_order,
-)
+from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions
+from gcar_deploy.inputs.order import MOST_VIEWS, POSES, Order, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_mask
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])

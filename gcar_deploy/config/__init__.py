@@ -11,6 +11,7 @@ from gcar_deploy.config.pictures import (
     DicomOptions,
     ImagingOptions,
     PictureLimits,
+    SegmenterName,
 )
 from gcar_deploy.config.pose import BundleOptions, PoseOptions
 from gcar_deploy.config.predict import (
@@ -18,7 +19,7 @@ from gcar_deploy.config.predict import (
     CandidateOptions,
     ModelLimits,
     PredictOptions,
-    Predictor,
+    PredictorName,
 )
 from gcar_deploy.config.quality import QualityOptions
 from gcar_deploy.config.ranges import check_options
@@ -28,7 +29,7 @@ from gcar_deploy.config.refine import (
     REFINERS,
     PaperOptions,
     RefineOptions,
-    Refiner,
+    RefinerName,
     TubeOptions,
 )
 
@@ -49,11 +50,12 @@ __all__ = [
     "PictureLimits",
     "PoseOptions",
     "PredictOptions",
-    "Predictor",
+    "PredictorName",
     "QualityOptions",
     "RefineOptions",
-    "Refiner",
+    "RefinerName",
     "RunOptions",
+    "SegmenterName",
     "TubeOptions",
     "check_options",
 ]

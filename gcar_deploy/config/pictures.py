@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from gcar_deploy.config.ranges import Range, Size
 
-Segmenter: TypeAlias = Literal["classic", "net", "auto"]
-SEGMENTERS = get_args(Segmenter)
+SegmenterName: TypeAlias = Literal["auto", "classic", "net"]
+SEGMENTERS = get_args(SegmenterName)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,4 +50,4 @@ class ImagingOptions:
     limits: PictureLimits = dataclasses.field(default_factory=PictureLimits)
     #: who finds vessels in grey values: the ridge filter, the network, or both (their mean, or the
     #: network alone where the views then agree better)
-    segmenter: Segmenter = "auto"
+    segmenter: SegmenterName = "auto"

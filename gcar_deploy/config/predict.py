@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from gcar_deploy.config.ranges import Range, Size
 
-Predictor: TypeAlias = Literal["auto", "multi", "single", "none"]
-PREDICTORS = get_args(Predictor)
+PredictorName: TypeAlias = Literal["auto", "multi", "single", "none"]
+PREDICTORS = get_args(PredictorName)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class PredictOptions:
 
     #: ``auto``: the shipped multi-view model, or the kind of the one given; ``none``: the visual
     #: hull is thinned
-    predictor: Predictor = "auto"
+    predictor: PredictorName = "auto"
     #: lattices on which the multi-view predictor judges the scene, each shifted against the others
     looks: Annotated[int, Range(1, 4)] = 2
     #: edge of the lattice the predictor works on: the grid's own within these bounds, mm; thin

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from gcar_deploy.config.ranges import Count, Range, Scale, Share
 
-Refiner: TypeAlias = Literal["tube", "paper", "none"]
-REFINERS = get_args(Refiner)
+RefinerName: TypeAlias = Literal["tube", "paper", "none"]
+REFINERS = get_args(RefinerName)
 Backend: TypeAlias = Literal["numpy", "torch"]
 BACKENDS = get_args(Backend)
 Device: TypeAlias = Literal["cpu", "cuda"]
@@ -123,7 +123,7 @@ class PaperOptions:
 class RefineOptions:
     """The Gaussian refinement."""
 
-    refiner: Refiner = "tube"
+    refiner: RefinerName = "tube"
     tube: TubeOptions = dataclasses.field(default_factory=TubeOptions)
     paper: PaperOptions = dataclasses.field(default_factory=PaperOptions)
     #: correct the tubes' occupancy by pictures and starting points; else round tubes only

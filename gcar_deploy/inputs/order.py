@@ -12,7 +12,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.config import DicomOptions, Landmark, RunOptions
+from gcar_deploy.config import (
+    PREDICTORS,
+    REFINERS,
+    SEGMENTERS,
+    DicomOptions,
+    Landmark,
+    RunOptions,
+)
 from gcar_deploy.config.ranges import Range, check_field, check_number
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.files import read_text
@@ -24,9 +31,6 @@ MOST_VIEWS = 16
 #: bytes of an order as JSON: a geometry may stand in it, and landmarks
 MAX_BYTES = 256 * 1024
 POSES = ("auto", "off")
-SEGMENTERS = ("auto", "classic", "net")
-PREDICTORS = ("auto", "multi", "single", "none")
-REFINERS = ("tube", "paper", "none")
 EXTRAS = ("glb", "dicom-stl")
 _NUMBER = re.compile(r"0|[1-9][0-9]?", re.ASCII)
 _CHOICES = {

@@ -9,16 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcar_deploy.config import RunOptions, check_options
+from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions, check_options
 from gcar_deploy.errors import UsageError
 from gcar_deploy.inputs.order import (
     EXTRAS,
     KEYS,
     POSES,
-    PREDICTORS,
-    REFINERS,
     SCHEMA,
-    SEGMENTERS,
     Order,
     load_order,
     order_to_json,
