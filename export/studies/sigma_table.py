@@ -1,7 +1,7 @@
 """Is the stated sigma true? Generated trees, geometry off by the stated prior, error over sigma.
 
 Every view after the first is turned and moved by draws from the prior that sigma includes
-(``TubeOptions.geometry_deg``, ``geometry_mm``); the reconstruction is told nothing of it. For each
+(``geometry.prior.LEFT_DEG``, ``LEFT_MM``); the reconstruction is told nothing of it. For each
 centreline point, e is its distance from the true centreline and sigma the stated standard
 deviation in the worst direction across the vessel. Points further than ``GHOST_MM`` from any
 vessel are ghosts: no sigma speaks of them, and their share stands beside.
@@ -20,10 +20,11 @@ from typing import cast
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gcar_deploy.config import PredictorName, RunOptions, TubeOptions
+from gcar_deploy.config import PredictorName, RunOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.result import Result
@@ -126,7 +127,7 @@ def calibrate_parts(
         tree = random_tree(rng)
         tree = tree.sides("left") if protocol == "clinical" else tree
         carms, grid = case_geometry(protocol, 2)
-        pictures = _pictures(tree, carms, rng, condition, options.refine.tube)
+        pictures = _pictures(tree, carms, rng, condition)
         try:
             result = engine.reconstruct(pictures, grid)
         except GcarError:
@@ -170,7 +171,7 @@ def sigma_parts(result: Result) -> Array:
     """
     carms = [view.carm for view in result.views]
     stated = np.concatenate([branch.sigma_mm for branch in result.tree.branches])
-    geometry = geometry_sigma(result.tree.points(), carms, result.options.refine.tube)
+    geometry = geometry_sigma(result.tree.points(), carms)
     pixel = PIXEL_SHARE * max(carm.pixel_at_isocenter_mm for carm in carms)
     fit = np.sqrt(np.maximum(stated**2 - geometry**2 - pixel**2, 0.0))
     return np.stack([fit, np.hypot(fit, geometry), stated])
@@ -205,16 +206,15 @@ def _pictures(
     told: Sequence[CArm],
     rng: np.random.Generator,
     condition: str,
-    options: TubeOptions,
 ) -> list[Angiogram]:
     """Pictures by views that are off by the prior, with the geometry as it is told."""
     out = []
     for number, carm in enumerate(told):
         true = carm
         if number:
-            primary, secondary = rng.normal(0.0, options.geometry_deg, 2)
+            primary, secondary = rng.normal(0.0, LEFT_DEG, 2)
             true = carm.turned(float(primary), float(secondary))
-            true = true.moved(rng.normal(0.0, options.geometry_mm, 3))
+            true = true.moved(rng.normal(0.0, LEFT_MM, 3))
         path = path_lengths(true, *tree.segments())
         if condition == "degraded":
             noise = rng.normal(0.0, 1.0, path.shape) * (NOISE_MM + NOISE_SHARE * path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Literal, TypeAlias, get_args
 
-from gcar_deploy.config.ranges import Count, Range, Scale, Share
+from gcar_deploy.config.ranges import Count, Range, Share
 
 RefinerName: TypeAlias = Literal["tube", "paper", "none"]
 REFINERS = get_args(RefinerName)
@@ -33,16 +33,8 @@ class TubeOptions:
     bend: Annotated[float, Range(1e-6, 1e9)] = 0.15
     #: radius: random walk of its log, 1 / sqrt(mm)
     taper: Annotated[float, Range(1e-6, 1e9)] = 0.1
-    #: pixels below this at the isocentre show narrow cores, and loosen the taper in proportion, mm
-    taper_pixel_mm: Scale = 0.85
-    #: ... but at most so many times
-    most_taper_easing: Annotated[float, Range(1, 1e6)] = 3.0
-    #: radii refitted with the axes held, on such fine pixels: steps, noise of the path length, mm
+    #: steps that refit the radii with the axes held, on fine pixels
     calibre_steps: Annotated[int, Range(0, 10000)] = 3
-    calibre_noise_mm: Annotated[float, Range(1e-3, 1e3)] = 0.15
-    #: ... and the walk of their log: scale, 1 / sqrt(mm), and Student's degrees of freedom
-    calibre_walk: Annotated[float, Range(1e-6, 1e9)] = 0.2
-    calibre_freedom: Annotated[float, Range(1e-3, 1e6)] = 3.0
     #: starting points: standard deviation over 1 mm of centreline, mm
     anchor_mm: Annotated[float, Range(1e-3, 1e6)] = 1.0
     #: starting radii: standard deviation of the log over 1 mm of centreline
@@ -51,28 +43,6 @@ class TubeOptions:
     edge_blur_mm: Annotated[float, Range(0, 100)] = 0.5
     #: share of the pictures' weight that goes to their centreline alone (the paper's 1 - alpha)
     centreline_share: Share = 0.0
-    #: a level ends when a step lowers the objective by less than this share
-    tolerance: Annotated[float, Range(0, 1)] = 3e-3
-    #: a branch or a free end is dropped where less than this share of it is seen in some view
-    min_seen: Share = 0.4
-    #: branches are judged in pieces of at most this length, mm
-    piece_mm: Annotated[float, Range(0.5, 1e6)] = 100.0
-    #: cost of a mm of piece per confidence below ``fair_confidence``, units of the objective
-    piece_cost: Annotated[float, Range(0, 1e6)] = 20.0
-    fair_confidence: Share = 0.4
-    #: a piece is never dropped whose confidence is at least this share of the kept ones' median
-    trusted_share: Annotated[float, Range(0, 1000)] = 0.8
-    #: a piece standing alone is at most so many times as thick as the starting points say
-    piece_growth: Annotated[float, Range(1e-3, 1e6)] = 2.5
-    #: a piece is kept from this share on; 0 keeps all
-    min_share: Share = 0.5
-    #: a dropped piece comes back where every view misses at least this share of it
-    missed_share: Share = 0.45
-    #: free ends grow along what no tube explains, at most this far, mm
-    max_growth_mm: Annotated[float, Range(0, 1000)] = 25.0
-    #: prior on the geometry that the stated sigma includes: angles, and table position
-    geometry_deg: Annotated[float, Range(0, 90)] = 0.5
-    geometry_mm: Annotated[float, Range(0, 1000)] = 0.5
 
     def contradiction(self) -> str:
         """Say which fields do not fit together; empty where all do."""
@@ -96,24 +66,19 @@ class PaperOptions:
     rate_intensity: Annotated[float, Range(0, 10)] = 0.05
     #: rates fall to this share of themselves over the steps
     final_rate: Annotated[float, Range(1e-6, 1)] = 0.2
-    #: start: points at least so confident, sigma in cells, and the cap that always holds
+    #: start: points at least so confident, and the cap that always holds
     least_confidence: Share = 0.3
-    initial_sigma_cells: Annotated[float, Range(1e-3, 3)] = 0.55
     most_gaussians: Annotated[int, Range(1, 1000000)] = 10_000
     #: points nearer than this to a more confident one share its Gaussian, cells; 0 keeps all.
     #: 1.1 halves Gaussians and time, and costs accuracy where the points are good
     thin_cells: Annotated[float, Range(0, 100)] = 0.0
-    #: bounds of the standard deviations
-    least_sigma_pixels: Annotated[float, Range(1e-3, 5)] = 0.25
-    largest_sigma_mm: Annotated[float, Range(0.01, 1000)] = 10.0
     #: density control: steps between, pull against the mean pull, size that splits, mass that goes
     control_every: Count = 40
     pull_ratio: Annotated[float, Range(0, 1e6)] = 4.0
     split_pixels: Annotated[float, Range(0, 1e6)] = 1.5
     least_mass_share: Share = 0.02
-    #: stop when the best of so many steps is not better by this share
+    #: stop when the best of so many steps is not better
     patience: Annotated[int, Range(1, 1_000_000)] = 20
-    tolerance: Share = 2e-3
     #: what projects: NumPy, or its reference twin
     backend: Backend = "numpy"
     device: Device = "cpu"

@@ -28,6 +28,12 @@ from gcar_deploy.types import Array, Points
 
 Progress = Callable[[float], None]
 MOST_REJECTED = 5
+#: sigma of a Gaussian at its start, cells
+INITIAL_SIGMA_CELLS = 0.55
+#: bounds of the standard deviations: pixels, mm
+LEAST_SIGMA_PIXELS, LARGEST_SIGMA_MM = 0.25, 10.0
+#: end where the best of ``patience`` steps is not better by this share
+TOLERANCE = 2e-3
 #: a Gaussian is at most so many times as long as it is wide
 MOST_ANISOTROPY = 20.0
 #: bounds of the contrast of a picture that is not calibrated
@@ -81,7 +87,7 @@ def initial_gaussians(centers: CenterPoints, options: PaperOptions) -> Gaussians
     mean: Array = np.stack(sums, axis=1) / weight[:, None]
     apart = np.sum((used.points_mm - mean[nearest]) ** 2, axis=1) / 3.0
     spread = np.bincount(nearest, share * apart, minlength=n) / weight
-    sigma = np.sqrt(spread + (options.initial_sigma_cells * h) ** 2)
+    sigma = np.sqrt(spread + (INITIAL_SIGMA_CELLS * h) ** 2)
     return Gaussians(
         means_mm=mean,
         scales_mm=np.repeat(sigma[:, None], 3, axis=1),
@@ -129,7 +135,7 @@ def refine_paper(
     backend = backend_named(options.backend, options.device)
     views = [sampled(view, options.pixel_mm) for view in views]
     finest = min(view.carm.pixel_at_isocenter_mm for view in views)
-    scaling = _Scaling(options.least_sigma_pixels * finest, options.largest_sigma_mm)
+    scaling = _Scaling(LEAST_SIGMA_PIXELS * finest, LARGEST_SIGMA_MM)
     free, adam = _capped(_freed(gaussians, scaling), scaling), _adam(options)
     losses: list[float] = []
     rejected = in_a_row = 0
@@ -290,7 +296,7 @@ def _no_progress(losses: Sequence[float], options: PaperOptions) -> bool:
     k = options.patience
     if len(losses) <= k:
         return False
-    return min(losses[-k:]) > (1 - options.tolerance) * min(losses[:-k])
+    return min(losses[-k:]) > (1 - TOLERANCE) * min(losses[:-k])
 
 
 def _controlled(

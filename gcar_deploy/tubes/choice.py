@@ -18,7 +18,6 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.optimize import minimize
 
-from gcar_deploy.config import TubeOptions
 from gcar_deploy.tree.edit import kept_branches, part_of
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
@@ -26,6 +25,18 @@ from gcar_deploy.tubes.support import least_seen
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Array, Scalars
 
+#: branches are judged in pieces of at most this length, mm
+PIECE_MM = 100.0
+#: cost of a mm of piece per confidence below ``FAIR_CONFIDENCE``, units of the objective
+PIECE_COST = 20.0
+FAIR_CONFIDENCE = 0.4
+#: a piece is never dropped whose confidence is at least this share of the kept ones' median
+TRUSTED_SHARE = 0.8
+#: a piece standing alone is at most so many times as thick as the starting points say
+PIECE_GROWTH = 2.5
+#: a piece is kept from this share on; a dropped one comes back where every view misses at least
+#: ``MISSED_SHARE`` of it
+MIN_SHARE, MISSED_SHARE = 0.5, 0.45
 #: least sine between vessel and ray when a path is turned into a radius.
 MIN_SINE = 0.35
 #: radii believed when a piece stands alone, mm.
@@ -49,9 +60,9 @@ class Pieces:
     share: Scalars
 
 
-def kept_tree(tree: Tree, pieces: Pieces, options: TubeOptions) -> Tree:
+def kept_tree(tree: Tree, pieces: Pieces) -> Tree:
     """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
-    return _kept(tree, tubes_of(tree), pieces, options)
+    return _kept(tree, tubes_of(tree), pieces)
 
 
 def reinstated(
@@ -60,7 +71,6 @@ def reinstated(
     start_radius: Scalars,
     targets: list[Target],
     left: list[Array],
-    options: TubeOptions,
 ) -> Pieces:
     """Take back dropped pieces that the views miss after all (``least_seen``).
 
@@ -74,10 +84,9 @@ def reinstated(
     start_radius : (n,) radius of its branch points by the starting points, mm
     targets : one per view
     left : per view (rows, cols), path that the kept pieces leave unexplained, mm
-    options : TubeOptions
     """
     tubes = dataclasses.replace(tubes_of(tree), log_radius=np.log(start_radius))
-    dropped = pieces.share < options.min_share
+    dropped = pieces.share < MIN_SHARE
     count = len(pieces.share)
     found = []
     for target, rest in zip(targets, left, strict=True):
@@ -86,7 +95,7 @@ def reinstated(
         claim = np.minimum(rest.reshape(-1)[seen.pixel], seen.path_mm)
         whole = np.bincount(piece, seen.path_mm, minlength=count)
         found.append(np.bincount(piece, claim, minlength=count) / np.maximum(whole, 1e-9))
-    missed = dropped & (least_seen(np.stack(found)) >= options.missed_share)
+    missed = dropped & (least_seen(np.stack(found)) >= MISSED_SHARE)
     return dataclasses.replace(pieces, share=np.where(missed, 1.0, pieces.share))
 
 
@@ -95,10 +104,9 @@ def weigh_pieces(
     tubes: Tubes,
     start_radius: Scalars,
     targets: list[Target],
-    options: TubeOptions,
 ) -> Pieces:
     """Cut the branches into pieces and solve for their shares."""
-    segment = _piece_of_segment(tree, tubes, options.piece_mm)
+    segment = _piece_of_segment(tree, tubes, PIECE_MM)
     count = int(segment.max()) + 1
     points = tubes.points_mm
     length = np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1)
@@ -109,16 +117,16 @@ def weigh_pieces(
         total, 1e-9
     )
     # Vessels that overlap each other in every view would all seem thick: the points say less.
-    radius = np.minimum(radius_alone(tubes, targets), options.piece_growth * start_radius)
+    radius = np.minimum(radius_alone(tubes, targets), PIECE_GROWTH * start_radius)
     alone = dataclasses.replace(tubes, log_radius=np.log(radius))
     gram, pull = _normal(alone, segment, count, targets)
-    cost = options.piece_cost * total * (options.fair_confidence - confidence)
+    cost = PIECE_COST * total * (FAIR_CONFIDENCE - confidence)
     share = _solve(gram, pull - cost, confidence)
-    kept = share >= options.min_share
+    kept = share >= MIN_SHARE
     if kept.any():
         # The level of confidence depends on the predictor; ghosts stand out below its usual.
         usual = _weighted_median(confidence[kept], total[kept])
-        share = np.where(confidence >= options.trusted_share * usual, 1.0, share)
+        share = np.where(confidence >= TRUSTED_SHARE * usual, 1.0, share)
     return Pieces(segment, total, confidence, share)
 
 
@@ -198,13 +206,13 @@ def _weighted_median(values: Scalars, weight: Scalars) -> float:
     return float(values[order][np.searchsorted(part, 0.5 * part[-1])])
 
 
-def _kept(tree: Tree, tubes: Tubes, pieces: Pieces, options: TubeOptions) -> Tree:
+def _kept(tree: Tree, tubes: Tubes, pieces: Pieces) -> Tree:
     """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
     branches: list[Branch] = []
     nodes = list(tree.nodes_mm)
     for k, branch in enumerate(tree.branches):
         own = np.flatnonzero(tubes.branch == k)
-        wanted = pieces.share[pieces.segment[own]] >= options.min_share
+        wanted = pieces.share[pieces.segment[own]] >= MIN_SHARE
         edges = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(int), [0]])))
         for first, stop in edges.reshape(-1, 2):
             part = part_of(branch, int(first), int(stop))

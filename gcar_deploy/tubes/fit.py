@@ -21,7 +21,7 @@ from gcar_deploy.tubes.gauss_newton import (
     rescaled,
 )
 from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
-from gcar_deploy.tubes.prior import Prior, make_prior
+from gcar_deploy.tubes.prior import TAPER_PIXEL_MM, Prior, make_prior
 from gcar_deploy.tubes.radius_refit import fit_calibre
 from gcar_deploy.tubes.settle import settled
 from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, unexplained
@@ -135,10 +135,10 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
         now = _State(tree_of(tubes, now.tree), tubes, prior, prints)
         if number or len(options.levels_mm) == 1:
             continue
-        if options.min_share > 0 and len(targets) > 1:
+        if len(targets) > 1:
             now = _chosen(now, start_radius, targets, run)
         if now.tree.branches:
-            now = run.fit(_supported(now, targets, options), targets, steps // 2)
+            now = run.fit(_supported(now, targets), targets, steps // 2)
         if not now.tree.branches:
             break
     contrast = tuple(target.contrast for target in targets)
@@ -163,7 +163,7 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
 
 def _recalibred(now: _State, targets: list[Target], options: TubeOptions) -> _State:
     """Refit the radii where the pixels are fine enough to show a narrow core."""
-    if _pixel_mm(targets) >= options.taper_pixel_mm:
+    if _pixel_mm(targets) >= TAPER_PIXEL_MM:
         return now
     tubes, prints = fit_calibre(now.tubes, targets, now.prints, options)
     return _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
@@ -193,26 +193,26 @@ def _chosen(now: _State, start_radius: Scalars, targets: list[Target], run: _Run
     """Drop ghosts, fit the rest, and take back what every view then misses."""
     options, tree = run.options, now.tree
     targets = rescaled(targets, now.prints)
-    pieces = weigh_pieces(tree, now.tubes, start_radius, targets, options)
+    pieces = weigh_pieces(tree, now.tubes, start_radius, targets)
     steps = options.steps[0] // 2
-    kept = run.fit(kept_tree(tree, pieces, options), targets, steps)
+    kept = run.fit(kept_tree(tree, pieces), targets, steps)
     prints = kept.prints or footprints(kept.tubes, targets)
     left = unexplained(targets, prints)
-    back = reinstated(tree, pieces, start_radius, targets, left, options)
+    back = reinstated(tree, pieces, start_radius, targets, left)
     if np.array_equal(back.share, pieces.share):
         return kept
-    return run.fit(kept_tree(tree, back, options), targets, steps)
+    return run.fit(kept_tree(tree, back), targets, steps)
 
 
-def _supported(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
+def _supported(now: _State, targets: list[Target]) -> Tree:
     """Cut what the pictures do not show, then grow along what the tree does not explain."""
     targets = rescaled(targets, now.prints)
     share = seen_share(now.tubes, targets, now.prints)
-    tree = supported_tree(now.tree, now.tubes, share, options)
-    if not tree.branches or options.max_growth_mm <= 0:
+    tree = supported_tree(now.tree, now.tubes, share)
+    if not tree.branches:
         return tree
     left = unexplained(targets, footprints(tubes_of(tree), targets))
-    return grown_tree(tree, targets, left, options)
+    return grown_tree(tree, targets, left)
 
 
 def tree_of(tubes: Tubes, tree: Tree) -> Tree:
@@ -233,7 +233,7 @@ def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree
     tangents = np.zeros_like(tubes.positions_mm)
     tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
     own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]
-    geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets], options)
+    geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets])
     pixel = PIXEL_SHARE * _pixel_mm(targets)
     sigma = np.sqrt(own**2 + geometry**2 + pixel**2)
     branches = [

@@ -26,6 +26,8 @@ from gcar_deploy.tubes.prior import Prior, columns_of
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Array, Scalars
 
+#: a level ends when a step lowers the objective by less than this share
+TOLERANCE = 3e-3
 #: bounds of the radius, mm.
 RADIUS_BOUNDS_MM = (0.2, 5.0)
 #: a step never moves a point or a log radius by more than this.
@@ -96,7 +98,7 @@ def fit_level(
         targets = rescaled(targets, prints)
         progress.steps += 1
         progress.losses.append(loss)
-        if gain < options.tolerance:
+        if gain < TOLERANCE:
             break
     return tubes, prints
 

@@ -17,6 +17,10 @@ from gcar_deploy.tubes.arrow import Arrow, plan_of
 from gcar_deploy.tubes.model import Tubes
 from gcar_deploy.types import Array, Scalars
 
+#: pixels below this at the isocentre show narrow cores, and loosen the taper in proportion, mm
+TAPER_PIXEL_MM = 0.85
+#: ... but at most so many times
+MOST_TAPER_EASING = 3.0
 #: confidence below which a starting point still holds a little.
 LEAST_TRUST = 0.05
 
@@ -45,7 +49,7 @@ class Prior:
 
     def at_pixel(self, pixel_mm: float, options: TubeOptions) -> Prior:
         """Return the prior round the same start for pictures of that pixel."""
-        if taper_easing(pixel_mm, options) == self.easing:
+        if taper_easing(pixel_mm) == self.easing:
             return self
         return make_prior(self.start, self.trust, options, pixel_mm)
 
@@ -66,12 +70,12 @@ class Prior:
         return Arrow(self.hessian.plan, self.hessian.data + sums[:size])
 
 
-def taper_easing(pixel_mm: float, options: TubeOptions) -> float:
+def taper_easing(pixel_mm: float) -> float:
     """Return the factor on the taper's random walk for pixels of that edge at the isocentre, mm.
 
-    1 down to ``taper_pixel_mm``, then growing as pixels shrink, to ``most_taper_easing``.
+    1 down to ``TAPER_PIXEL_MM``, then growing as pixels shrink, to ``MOST_TAPER_EASING``.
     """
-    return min(max(options.taper_pixel_mm / pixel_mm, 1.0), options.most_taper_easing)
+    return min(max(TAPER_PIXEL_MM / pixel_mm, 1.0), MOST_TAPER_EASING)
 
 
 def make_prior(
@@ -86,7 +90,7 @@ def make_prior(
     options : TubeOptions
     pixel_mm : pixel of the pictures at the isocentre
     """
-    easing = taper_easing(pixel_mm, options)
+    easing = taper_easing(pixel_mm)
     p, n = len(tubes.positions_mm), len(tubes.log_radius)
     points = tubes.points_mm
     gap = np.maximum(np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1), 1e-3)

@@ -24,6 +24,10 @@ from gcar_deploy.tubes.model import Footprint, Tubes
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Scalars
 
+#: noise of the path length, mm
+NOISE_MM = 0.15
+#: walk of the log radius: scale, 1 / sqrt(mm), and Student's degrees of freedom
+WALK, FREEDOM = 0.2, 3.0
 #: reweightings of the prior for each look at the pictures
 _REWEIGHTINGS = 3
 
@@ -38,8 +42,7 @@ def fit_calibre(
     tubes : Tubes after the last level
     targets : of the pictures' own pixels
     prints : where the tubes fall in them
-    options : TubeOptions; ``calibre_steps``, ``calibre_noise_mm``, ``calibre_walk``,
-        ``calibre_freedom``
+    options : TubeOptions; ``calibre_steps``
 
     Returns
     -------
@@ -49,9 +52,7 @@ def fit_calibre(
     if not all(target.calibrated for target in targets) or not len(tubes.log_radius):
         return tubes, prints
     sharp = [
-        dataclasses.replace(
-            target, sigma_mm=options.calibre_noise_mm + options.noise_share * target.path_mm
-        )
+        dataclasses.replace(target, sigma_mm=NOISE_MM + options.noise_share * target.path_mm)
         for target in targets
     ]
     low, high = np.log(RADIUS_BOUNDS_MM)
@@ -73,13 +74,13 @@ def _step(
     x0 = tubes.log_radius
     a, b = tubes.first, tubes.second
     gap = np.maximum(np.linalg.norm(tubes.points_mm[b] - tubes.points_mm[a], axis=1), 1e-3)
-    stiff = 1.0 / (options.calibre_walk**2 * gap)
+    stiff = 1.0 / (WALK**2 * gap)
     wanted = pull + diagonal * x0
     wanted[:-1] += beside[:-1] * x0[1:]
     wanted[1:] += beside[:-1] * x0[:-1]
     x = x0
     for _ in range(_REWEIGHTINGS):
-        nu = options.calibre_freedom
+        nu = FREEDOM
         q = stiff * (nu + 1) / (nu + stiff * (x[b] - x[a]) ** 2)
         n = len(x0)
         band = np.stack([diagonal + np.bincount(a, q, n) + np.bincount(b, q, n) + 1e-9, beside])

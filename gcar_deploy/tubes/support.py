@@ -8,13 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from gcar_deploy.config import TubeOptions
 from gcar_deploy.tree.edit import kept_branches, part_of, with_ends_moved
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Footprint, Tubes
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Array, Points, Scalars
 
+#: a branch or a free end is dropped where less than this share of it is seen in some view
+MIN_SEEN = 0.4
+#: free ends grow along what no tube explains, at most this far, mm
+MAX_GROWTH_MM = 25.0
 #: step and directions of a growing end.
 GROWTH_STEP_MM = 1.0
 GROWTH_CONE_DEG = 35.0
@@ -63,14 +66,13 @@ def seen_share(tubes: Tubes, targets: list[Target], prints: list[Footprint]) -> 
     return out
 
 
-def supported_tree(tree: Tree, tubes: Tubes, share: Array, options: TubeOptions) -> Tree:
+def supported_tree(tree: Tree, tubes: Tubes, share: Array) -> Tree:
     """Drop branches and cut free ends that the views do not show (``least_seen``).
 
     Parameters
     ----------
     tree : Tree in step with ``tubes``
     share : (views, segments) from ``seen_share``
-    options : TubeOptions
     """
     worst = least_seen(share)
     degrees = tree.degrees
@@ -78,7 +80,7 @@ def supported_tree(tree: Tree, tubes: Tubes, share: Array, options: TubeOptions)
     keep: list[bool] = []
     for k, branch in enumerate(tree.branches):
         own = worst[tubes.branch == k]
-        good = ndimage.uniform_filter1d(own, 3, mode="nearest") >= options.min_seen
+        good = ndimage.uniform_filter1d(own, 3, mode="nearest") >= MIN_SEEN
         first, last = 0, len(branch) - 1
         if good.any():
             if degrees[branch.start] == 1:
@@ -86,7 +88,7 @@ def supported_tree(tree: Tree, tubes: Tubes, share: Array, options: TubeOptions)
             if degrees[branch.end] == 1:
                 last = len(good) - int(np.argmax(good[::-1]))
         leaf = degrees[branch.start] == 1 or degrees[branch.end] == 1
-        keep.append(bool(np.median(own[first:last]) >= options.min_seen) or not leaf)
+        keep.append(bool(np.median(own[first:last]) >= MIN_SEEN) or not leaf)
         branches.append(part_of(branch, first, last))
     cut = with_ends_moved(dataclasses.replace(tree, branches=tuple(branches)))
     return kept_branches(cut, np.array(keep, bool))
@@ -101,9 +103,7 @@ def unexplained(targets: list[Target], prints: list[Footprint]) -> list[Array]:
     ]
 
 
-def grown_tree(
-    tree: Tree, targets: list[Target], left: Sequence[Array], options: TubeOptions
-) -> Tree:
+def grown_tree(tree: Tree, targets: list[Target], left: Sequence[Array]) -> Tree:
     """Lengthen free ends along what every view shows and no tube explains."""
     degrees = tree.degrees
     branches = list(tree.branches)
@@ -114,7 +114,7 @@ def grown_tree(
                 continue
             points = branch.points_mm if at_end else branch.points_mm[::-1]
             radius = float(np.median((branch.radius_mm if at_end else branch.radius_mm[::-1])[-3:]))
-            new = _grow(points, radius, targets, left, options.max_growth_mm)
+            new = _grow(points, radius, targets, left, MAX_GROWTH_MM)
             if len(new) * GROWTH_STEP_MM >= MIN_GROWTH_MM:
                 branch = _lengthened(branch, new, radius, at_end)
         branches[k] = branch

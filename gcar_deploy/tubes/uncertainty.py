@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcar_deploy.config import TubeOptions
 from gcar_deploy.errors import NumericalError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.tubes.arrow import Arrow
 from gcar_deploy.types import Array, Points, Scalars
 
@@ -62,11 +62,11 @@ def fit_sigma(hessian: Arrow, owner: Array, tangents: Points) -> Scalars:
     return out
 
 
-def geometry_sigma(points_mm: Points, carms: list[CArm], options: TubeOptions) -> Scalars:
+def geometry_sigma(points_mm: Points, carms: list[CArm]) -> Scalars:
     """(n,) movement of triangulated points under the stated prior of the geometry, mm.
 
-    Each view after the first may have its two angles off by ``geometry_deg`` and the table by
-    ``geometry_mm`` along each axis, independently.
+    Each view after the first may have its two angles off by ``LEFT_DEG`` and the table by
+    ``LEFT_MM`` along each axis, independently.
     """
     if len(carms) < 2 or not len(points_mm):
         return np.zeros(len(points_mm))
@@ -76,10 +76,10 @@ def geometry_sigma(points_mm: Points, carms: list[CArm], options: TubeOptions) -
     total = np.zeros(len(points_mm))
     for v, carm in enumerate(carms[1:], start=1):
         base = carm.project(points_mm)[0]
-        changed = [carm.moved(options.geometry_mm * axis) for axis in np.eye(3)]
+        changed = [carm.moved(LEFT_MM * axis) for axis in np.eye(3)]
         changed += [
-            carm.turned(primary_deg=options.geometry_deg),
-            carm.turned(secondary_deg=options.geometry_deg),
+            carm.turned(primary_deg=LEFT_DEG),
+            carm.turned(secondary_deg=LEFT_DEG),
         ]
         for other in changed:
             shift = np.nan_to_num(other.project(points_mm)[0] - base, posinf=0.0, neginf=0.0)

@@ -13,7 +13,7 @@ import pytest
 from gcar_deploy.config import PaperOptions
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.gaussians.paper import MOST_ANISOTROPY, refine_paper
+from gcar_deploy.gaussians.paper import LARGEST_SIGMA_MM, MOST_ANISOTROPY, refine_paper
 from gcar_deploy.gaussians.project import project
 from gcar_deploy.gaussians.voxelize import voxelize
 from gcar_deploy.geometry.grid import Grid
@@ -47,7 +47,7 @@ def check(out, options=OPTIONS):
     for array in (g.means_mm, g.scales_mm, g.quaternions_wxyz, g.intensity):
         assert np.isfinite(array).all()
     assert (g.intensity >= 0).all() and g.intensity.max(initial=0.0) < 2e4
-    assert g.scales_mm.max() <= options.largest_sigma_mm * (1 + 1e-9)
+    assert g.scales_mm.max() <= LARGEST_SIGMA_MM * (1 + 1e-9)
     slimmest = g.scales_mm.min(axis=1) * MOST_ANISOTROPY
     # Rounding through the sigmoid, and one step after the last cap.
     assert (g.scales_mm.max(axis=1) <= 1.1 * slimmest).all()

@@ -22,7 +22,7 @@ def net():
 def test_who_needs_it():
     assert load_segmenter("classic") is None
     assert load_segmenter("auto") is not None
-    with pytest.raises(UsageError, match="classic, net, auto"):
+    with pytest.raises(UsageError, match="auto, classic, net"):
         load_segmenter("best")
 
 

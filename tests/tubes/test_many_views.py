@@ -41,7 +41,7 @@ def test_a_branch_stays_while_few_views_fail_to_show_it(views, failing, stays):
     share = np.ones((views, len(tubes.first)))
     share[:failing, tubes.branch == 1] = 0.0
     tip = tree.nodes_mm[2]
-    kept = supported_tree(tree, tubes, share, OPTIONS)
+    kept = supported_tree(tree, tubes, share)
     assert (cKDTree(kept.points()).query(tip)[0] < 1.0) == stays
 
 

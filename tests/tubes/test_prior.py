@@ -7,6 +7,7 @@ import pytest
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes import prior
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.model import tubes_of
 from gcar_deploy.tubes.prior import make_prior, taper_easing
@@ -21,7 +22,7 @@ OPTIONS = TubeOptions()
     [(np.inf, 1.0), (1.08, 1.0), (0.85, 1.0), (0.425, 2.0), (0.27, 3.0), (0.05, 3.0)],
 )
 def test_easing_grows_as_pixels_shrink_and_is_bounded(pixel_mm, factor):
-    assert taper_easing(pixel_mm, OPTIONS) == pytest.approx(factor)
+    assert taper_easing(pixel_mm) == pytest.approx(factor)
 
 
 def test_only_the_taper_is_eased():
@@ -52,14 +53,16 @@ def narrowed():
     return Tree(nodes_mm=line[[0, -1]], branches=(branch(line, radius),))
 
 
-def test_a_narrow_core_is_seen_in_fine_pixels():
+def test_a_narrow_core_is_seen_in_fine_pixels(monkeypatch):
     truth = narrowed()
     views = seen(truth, two_views(512, 0.3))
     centers = points_of(truth, grid(64))
     least = {}
-    for most in (1.0, OPTIONS.most_taper_easing):
-        options = dataclasses.replace(OPTIONS, most_taper_easing=most, calibre_steps=0)
+    options = dataclasses.replace(OPTIONS, calibre_steps=0)
+    eased = prior.MOST_TAPER_EASING
+    for most in (1.0, eased):
+        monkeypatch.setattr(prior, "MOST_TAPER_EASING", most)
         tree = fit_tubes(centers, views, options).tree
         middle = np.abs(tree.points()[:, 2]) < 5
         least[most] = tree.radii()[middle].min() - 0.6
-    assert abs(least[OPTIONS.most_taper_easing]) < 0.5 * least[1.0]
+    assert abs(least[eased]) < 0.5 * least[1.0]

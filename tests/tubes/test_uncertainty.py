@@ -7,6 +7,7 @@ import pytest
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.epipolar import triangulate
+from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import footprints, normal_equations
 from gcar_deploy.tubes.model import tubes_of
@@ -84,8 +85,8 @@ def test_white_noise_moves_a_tube_by_the_bound():
 @pytest.mark.parametrize("theta", [30, 60, 90, 140])
 def test_geometry_sigma_of_the_isocentre(theta):
     """Only the table moves it: across view 2 by 1 / sin(theta), along the axis by a half."""
-    sigma = geometry_sigma(np.zeros((1, 3)), [carm(0, 0), carm(theta, 0)], OPTIONS)
-    expected = OPTIONS.geometry_mm * np.hypot(1 / np.sin(np.radians(theta)), 0.5)
+    sigma = geometry_sigma(np.zeros((1, 3)), [carm(0, 0), carm(theta, 0)])
+    expected = LEFT_MM * np.hypot(1 / np.sin(np.radians(theta)), 0.5)
     assert sigma[0] == pytest.approx(expected, rel=1e-3)
 
 
@@ -94,11 +95,11 @@ def test_geometry_sigma_is_how_far_triangulated_points_scatter():
     points = rng.uniform(-40, 40, (50, 3))
     squares = []
     for _ in range(200):
-        turn, shift = rng.normal(0, OPTIONS.geometry_deg, 2), rng.normal(0, OPTIONS.geometry_mm, 3)
+        turn, shift = rng.normal(0, LEFT_DEG, 2), rng.normal(0, LEFT_MM, 3)
         real = [told[0], told[1].turned(*turn).moved(shift)]
         found = triangulate(told, [view.project(points)[0] for view in real])[0]
         squares.append(np.sum((found - points) ** 2, axis=1))
-    stated = geometry_sigma(points, told, OPTIONS)
+    stated = geometry_sigma(points, told)
     assert np.sqrt(np.mean(squares)) == pytest.approx(np.sqrt(np.mean(stated**2)), rel=0.1)
 
 
@@ -112,8 +113,8 @@ def test_errors_of_whole_fits_are_those_that_sigma_states():
         centers = points_of(tree, grid(80))
         for seed in range(8):
             rng = np.random.default_rng([seed, len(tree.branches)])
-            turn = rng.normal(0, OPTIONS.geometry_deg, 2)
-            shift = rng.normal(0, OPTIONS.geometry_mm, 3)
+            turn = rng.normal(0, LEFT_DEG, 2)
+            shift = rng.normal(0, LEFT_MM, 3)
             pictures = seen(tree, [told[0], told[1].turned(*turn).moved(shift)])
             views = [
                 dataclasses.replace(
@@ -131,7 +132,7 @@ def test_errors_of_whole_fits_are_those_that_sigma_states():
             z.append(error / sigma)
             # No point is surer than the pixel and the stated geometry allow.
             pixel = 0.45 * told[0].pixel_at_isocenter_mm
-            geometry = geometry_sigma(fitted.points(), told, OPTIONS)
+            geometry = geometry_sigma(fitted.points(), told)
             assert (sigma >= 0.999 * np.hypot(pixel, geometry)).all()
     together = np.concatenate(z)
     assert 0.5 < np.mean(together**2) < 1.7
