@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from gcar_deploy.cli.main import gcar
-from gcar_deploy.config import BundleOptions, PredictOptions, RefineOptions, RunOptions
+from gcar_deploy.config import PredictOptions, RefineOptions, RunOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
@@ -136,12 +136,12 @@ def three_raw_views_with_the_table_moved():
     return angiograms, Grid(center_mm=(0, 0, 0), size_mm=(130,) * 3, shape=(64,) * 3)
 
 
-def test_three_views_are_placed_as_run_places_them():
+def test_three_views_are_placed_as_run_places_them(monkeypatch):
     """Also by the tree that they show, and what is said of the correction is the same."""
+    monkeypatch.setattr("gcar_deploy.pose.bundling.LEAST_PX", 0.0)
     angiograms, grid = three_raw_views_with_the_table_moved()
     options = RunOptions(
         predict=PredictOptions(predictor="none"), refine=RefineOptions(refiner="none"),
-        bundle=BundleOptions(least_px=0.0),
     )  # fmt: skip
     result = Engine(threads=1, options=options).reconstruct(angiograms, grid)
     found = inspect_files(angiograms, grid, options)

@@ -13,7 +13,7 @@ from gcar_deploy.config.pictures import (
     PictureLimits,
     SegmenterName,
 )
-from gcar_deploy.config.pose import BundleOptions, PoseOptions
+from gcar_deploy.config.pose import PoseOptions
 from gcar_deploy.config.predict import (
     PREDICTORS,
     CandidateOptions,
@@ -39,7 +39,6 @@ __all__ = [
     "PREDICTORS",
     "REFINERS",
     "SEGMENTERS",
-    "BundleOptions",
     "CandidateOptions",
     "DicomLimits",
     "DicomOptions",
@@ -71,7 +70,6 @@ class RunOptions:
     dicom: DicomOptions = dataclasses.field(default_factory=DicomOptions)
     imaging: ImagingOptions = dataclasses.field(default_factory=ImagingOptions)
     pose: PoseOptions = dataclasses.field(default_factory=PoseOptions)
-    bundle: BundleOptions = dataclasses.field(default_factory=BundleOptions)
     candidates: CandidateOptions = dataclasses.field(default_factory=CandidateOptions)
     predict: PredictOptions = dataclasses.field(default_factory=PredictOptions)
     refine: RefineOptions = dataclasses.field(default_factory=RefineOptions)

@@ -18,14 +18,22 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gcar_deploy.config import BundleOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import ray_gaps
+from gcar_deploy.geometry.prior import ANGLE_DEG, LANDMARK_MM, OFFSET_MM
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.joint import corrected
 from gcar_deploy.tree.tree import Tree, along
 from gcar_deploy.types import Array, Points, Scalars
 
+#: one standard deviation of a picture's centreline (neighbours err alike, so this is more than a
+#: single point's error), and of a point's step, mm
+LINE_MM, POINT_MM = 1.0, 2.0
+#: a picture's line counts for a point within this reach, which shrinks to the second, mm
+REACH_MM, NEAR_MM = 8.0, 2.0
+STEPS = 25
+#: points of the tree this far apart, mm, and how few say nothing
+SPACING_MM, LEAST_POINTS = 2.0, 20
 #: step of a correction for its derivative, degrees or mm
 _TURN_DEG = 0.05
 
@@ -49,7 +57,7 @@ class Adjusted:
 
 def adjust(
     tree: Tree, views: Sequence[VesselImage], told: Sequence[CArm], theta: Array,
-    options: BundleOptions, marks: Array | None = None,
+    marks: Array | None = None,
 ) -> Adjusted:  # fmt: skip
     """Estimate the corrections of all views but the first from the tree that all show.
 
@@ -59,16 +67,15 @@ def adjust(
     views : V vessel images; of their C-arms nothing is used
     told : V C-arms without corrections, of the views' sizes
     theta : (V, 5) corrections that the tree was made with, the first of them zero
-    options : BundleOptions
     marks : (m, V, 2) landmarks, (col, row), nan where not seen: rays of one point must meet
     """
-    points = _sampled(tree, options.spacing_mm)
+    points = _sampled(tree, SPACING_MM)
     lines = [_Lines.of(view) for view in views]
-    if len(points) < options.least_points or not all(line.any for line in lines):
+    if len(points) < LEAST_POINTS or not all(line.any for line in lines):
         return Adjusted(theta, 0.0, 0.0)
     pixels = np.empty((0, len(told), 2)) if marks is None else marks
-    kept, before = _settled(points, lines, told, theta, pixels, options, poses=False)
-    found, after = _settled(points, lines, told, theta, pixels, options, poses=True)
+    kept, before = _settled(points, lines, told, theta, pixels, poses=False)
+    found, after = _settled(points, lines, told, theta, pixels, poses=True)
     return Adjusted(found, before, after) if after < before else Adjusted(kept, before, before)
 
 
@@ -116,18 +123,18 @@ def _sampled(tree: Tree, spacing_mm: float) -> Points:
 
 def _settled(
     points: Points, lines: Sequence[_Lines], told: Sequence[CArm], theta: Array, marks: Array,
-    options: BundleOptions, *, poses: bool,
+    *, poses: bool,
 ) -> tuple[Array, float]:  # fmt: skip
     """Corrections and mean distance after the steps; ``poses`` False moves the points alone."""
     theta, points = theta.copy(), points.copy()
-    reach = options.reach_mm
-    for _ in range(options.steps):
+    reach = REACH_MM
+    for _ in range(STEPS):
         parts = _linearised(points, lines, told, theta, reach)
-        move, turn = _step(*parts, theta, _marked(told, theta, marks, options), options)
+        move, turn = _step(*parts, theta, _marked(told, theta, marks))
         points = points + move
         if poses:
             theta[1:] += turn
-        reach = max(options.near_mm, 0.8 * reach)
+        reach = max(NEAR_MM, 0.8 * reach)
     gap = _linearised(points, lines, told, theta, reach)[0]
     return theta, float(np.minimum(np.abs(gap), reach).mean())
 
@@ -170,21 +177,19 @@ def _linearised(
     return gap, weight, by_point, by_pose
 
 
-def _prior(theta: Array, options: BundleOptions) -> Array:
+def _prior(theta: Array) -> Array:
     """(V - 1, 5) inverse variances of the corrections.
 
     A patient breathes by millimetres or the table moves by centimetres, so the offset has heavy
     tails: Cauchy's density of its length, as the Gaussian with the same pull where it stands.
     """
     length2 = np.sum(theta[1:, :3] ** 2, axis=1, keepdims=True)
-    offset = 2.0 / (options.offset_scale_mm**2 + length2)
-    turn = np.full_like(offset, options.angle_sigma_deg**-2)
+    offset = 2.0 / (OFFSET_MM**2 + length2)
+    turn = np.full_like(offset, ANGLE_DEG**-2)
     return np.hstack([offset] * 3 + [turn] * 2)
 
 
-def _marked(
-    told: Sequence[CArm], theta: Array, marks: Array, options: BundleOptions
-) -> tuple[Scalars, Array]:
+def _marked(told: Sequence[CArm], theta: Array, marks: Array) -> tuple[Scalars, Array]:
     """(r,) gaps between the rays of landmarks and (r, V - 1, 5) their change, standardised."""
     pairs = list(itertools.combinations(range(len(told)), 2))
     seen = [np.isfinite(marks[:, pair]).all(axis=(1, 2)) for pair in pairs]
@@ -195,7 +200,7 @@ def _marked(
             ray_gaps(now[i], now[j], marks[ok, i], marks[ok, j])
             for (i, j), ok in zip(pairs, seen, strict=True)
         ]
-        return np.concatenate(parts) / options.landmark_sigma_mm
+        return np.concatenate(parts) / LANDMARK_MM
 
     here = gaps(theta)
     change = np.zeros((len(here), len(theta) - 1, 5))
@@ -208,12 +213,12 @@ def _marked(
 
 def _step(
     gap: Scalars, weight: Scalars, by_point: Array, by_pose: Array, theta: Array,
-    marked: tuple[Scalars, Array], options: BundleOptions,
+    marked: tuple[Scalars, Array],
 ) -> tuple[Points, Array]:  # fmt: skip
     """Gauss-Newton step of (n, 3) points and (V - 1, 5) corrections, the points eliminated."""
-    count, prior = len(theta) - 1, _prior(theta, options)
-    w = weight / options.line_sigma_mm**2
-    H = np.einsum("kn,kni,knj->nij", w, by_point, by_point) + np.eye(3) / options.point_sigma_mm**2
+    count, prior = len(theta) - 1, _prior(theta)
+    w = weight / LINE_MM**2
+    H = np.einsum("kn,kni,knj->nij", w, by_point, by_point) + np.eye(3) / POINT_MM**2
     g = np.einsum("kn,kni,kn->ni", w, by_point, gap)
     inverse = np.linalg.inv(H)
     # B[n, k]: coupling of point n with view k, (3, 5)

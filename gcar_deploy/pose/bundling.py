@@ -14,8 +14,14 @@ from gcar_deploy.pose.agreement import poses_between
 from gcar_deploy.pose.bundle_adjustment import adjust
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.pose.profile_fit import MIN_GAIN
 from gcar_deploy.tree.tree import Tree
 
+#: a tree and its views' poses are fitted to each other at most so often
+ROUNDS = 2
+#: a tree that lies this near to all lines, in pixels, is left alone (16 generated scenes, moved and
+#: corrected by profiles: 0.2 .. 0.5); else the distance must fall to ``MIN_GAIN`` of what it was
+LEAST_PX = 0.6
 #: makes a tree of views that have their corrections built in
 TreeOf: TypeAlias = Callable[[Sequence[VesselImage]], Tree]
 #: a view that moves by less than this between rounds has arrived, mm
@@ -43,7 +49,6 @@ def bundled(
     view had to be moved, where all pictures are calibrated (their profiles place them more exactly
     than lines do), or where the adjustment does not bring the tree clearly nearer to the pictures
     """
-    o = options.bundle
     told = [view.carm for view in views]
     first = poses = tuple(poses)
     if len(views) < 3 or not options.pose.enabled or all(view.calibrated for view in views):
@@ -51,12 +56,12 @@ def bundled(
     if not any(pose.theta.any() for pose in poses):
         return poses
     marks = landmark_pixels(options.landmarks, told)
-    for _ in range(o.rounds):
+    for _ in range(ROUNDS):
         theta = np.stack([pose.theta for pose in poses])
         tree = tree_of([posed(view, pose) for view, pose in zip(views, poses, strict=True)])
-        found = adjust(tree, views, told, theta, o, marks)
-        near_mm = o.least_px * max(carm.pixel_at_isocenter_mm for carm in told)
-        if found.before_mm < near_mm or found.after_mm >= o.min_gain * found.before_mm:
+        found = adjust(tree, views, told, theta, marks)
+        near_mm = LEAST_PX * max(carm.pixel_at_isocenter_mm for carm in told)
+        if found.before_mm < near_mm or found.after_mm >= MIN_GAIN * found.before_mm:
             break
         poses = tuple(_at(pose, t) for pose, t in zip(poses, found.theta, strict=True))
         if np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM:

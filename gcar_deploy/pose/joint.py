@@ -20,8 +20,28 @@ from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
-from gcar_deploy.pose.profile_fit import fit_profiles, prior_root, prior_sigmas
+from gcar_deploy.geometry.prior import LANDMARK_MM, OFFSET_MM
+from gcar_deploy.pose.profile_fit import (
+    MIN_GAIN,
+    MOST_APART_DEG,
+    PROFILE_NOISE,
+    SEARCH_MM,
+    STEP_MM,
+    fit_profiles,
+    prior_root,
+    prior_sigmas,
+)
 from gcar_deploy.types import Array, Scalars
+
+#: directions nearer than this tell nothing of each other; and from how many starts the views'
+#: offsets are sought together
+LEAST_APART_DEG = 10.0
+STARTS = 60
+#: more views than this are corrected pair by pair alone
+MOST_VIEWS = 4
+#: pairs that disagree by no more than this as they are told, are left alone (four views of one
+#: tree, exactly placed, pixels of 1.4 mm: up to 0.08)
+AGREED = 0.09
 
 
 def corrected(carm: CArm, theta: Array) -> CArm:
@@ -53,9 +73,9 @@ def estimate_jointly(
     """
     seen = {k: mass for k, mass in enumerate(masses) if mass is not None}
     problem = _Problem(seen, options, marks)
-    if len(problem.pairs) < 3 or len(seen) > options.joint_most_views:
+    if len(problem.pairs) < 3 or len(seen) > MOST_VIEWS:
         return first
-    if not first.any() and max(problem.disagreements(first)) <= options.agreed:
+    if not first.any() and max(problem.disagreements(first)) <= AGREED:
         return first
     theta = problem.fitted(problem.shifts(first))
     if problem.mean_disagreement(theta) >= problem.mean_disagreement(first):
@@ -77,13 +97,13 @@ class _Problem:
         out = []
         for i, j in itertools.combinations(self.seen, 2):
             apart = separation_deg(self.seen[i].carm, self.seen[j].carm)
-            if self.options.least_apart_deg <= apart <= self.options.most_apart_deg:
+            if LEAST_APART_DEG <= apart <= MOST_APART_DEG:
                 out.append((i, j))
         return out
 
     @property
     def prior(self) -> Array:
-        return prior_sigmas(self.options)
+        return prior_sigmas()
 
     def pair(self, i: int, j: int, theta: Array) -> tuple[Mass, Mass, CArm]:
         """Both views with the correction of the first built in, and the second's C-arm."""
@@ -102,7 +122,7 @@ class _Problem:
         """All differences, landmark gaps and corrections over their standard deviations."""
         theta = _with_first(x)
         parts = [
-            prior_root(self.seen[k].carm, self.options) @ t if k in self.seen else t / self.prior
+            prior_root(self.seen[k].carm) @ t if k in self.seen else t / self.prior
             for k, t in enumerate(theta[1:], start=1)
         ]
         for i, j in self.pairs:
@@ -111,7 +131,7 @@ class _Problem:
             if len(seen):
                 fixed, _, carm = self.pair(i, j, theta)
                 gaps = ray_gaps(fixed.carm, carm, seen[:, i], seen[:, j])
-                parts.append(gaps / self.options.landmark_sigma_mm)
+                parts.append(gaps / LANDMARK_MM)
         return np.concatenate(parts)
 
     def left(self, x: Array, sigma_mm: float) -> float:
@@ -137,8 +157,7 @@ class _Problem:
         So each pair is asked once for its misfit at every such shift, and the offsets are sought
         on those curves, from many starts: profiles that are far off have many local minima.
         """
-        o = self.options
-        steps = np.arange(-2 * o.search_mm, 2 * o.search_mm + 1e-9, o.step_mm)
+        steps = np.arange(-2 * SEARCH_MM, 2 * SEARCH_MM + 1e-9, STEP_MM)
         zero, curves = np.zeros_like(first), []
         for i, j in self.pairs:
             fixed, moving, _ = self.pair(i, j, zero)
@@ -147,14 +166,14 @@ class _Problem:
             for step in steps:
                 at = zero.copy()
                 at[j, :3] = step * normal
-                apart = self.differences(i, j, at, o.coarse_mm) / o.profile_noise
+                apart = self.differences(i, j, at, self.options.coarse_mm) / PROFILE_NOISE
                 misfit.append(float(np.sum(apart**2)))
             curves.append((i, j, normal, CubicSpline(steps, misfit, bc_type="clamped")))
 
         def cost(x: Array) -> tuple[float, Array]:
             d = np.vstack([np.zeros(3), x.reshape(-1, 3)])
-            value = float(np.sum((d / o.offset_sigma_mm) ** 2))
-            slope = 2.0 * d / o.offset_sigma_mm**2
+            value = float(np.sum((d / OFFSET_MM) ** 2))
+            slope = 2.0 * d / OFFSET_MM**2
             for i, j, normal, curve in curves:
                 along = float(np.clip(normal @ (d[j] - d[i]), steps[0], steps[-1]))
                 value += float(curve(along))
@@ -164,7 +183,7 @@ class _Problem:
             return value, slope[1:].ravel()
 
         rng = np.random.default_rng(0)
-        spread = rng.normal(0.0, 2.0 * o.offset_sigma_mm, (o.joint_starts, 3 * (len(first) - 1)))
+        spread = rng.normal(0.0, 2.0 * OFFSET_MM, (STARTS, 3 * (len(first) - 1)))
         starts = [first[1:, :3].ravel(), np.zeros(3 * (len(first) - 1)), *spread]
         found = [minimize(cost, s, jac=True, method="L-BFGS-B") for s in starts]
         out = zero.copy()
@@ -187,7 +206,7 @@ class _Problem:
             less = theta.copy()
             less[k] = 0.0
             alone = self.mean_disagreement(less, k)
-            if self.mean_disagreement(theta, k) > self.options.min_gain * alone:
+            if self.mean_disagreement(theta, k) > MIN_GAIN * alone:
                 theta = less
         return theta
 

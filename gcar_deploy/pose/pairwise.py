@@ -25,9 +25,22 @@ from gcar_deploy.geometry.consistency import (
     vessel_mass,
 )
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
+from gcar_deploy.geometry.prior import LANDMARK_MM
 from gcar_deploy.pose.joint import corrected, estimate_jointly
-from gcar_deploy.pose.profile_fit import fit_profiles, prior_root, prior_sigmas
+from gcar_deploy.pose.profile_fit import (
+    MIN_GAIN,
+    MOST_APART_DEG,
+    PROFILE_NOISE,
+    SEARCH_MM,
+    STEP_MM,
+    fit_profiles,
+    prior_root,
+    prior_sigmas,
+)
 from gcar_deploy.types import Array, Image, Pixels
+
+#: calibrated pictures that agree so well as they are told are left alone: pixels, not poses
+AGREED_CALIBRATED = 0.002
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,7 +128,7 @@ def estimate_poses(
         )
         placed = masses[partner]
         apart = separation_deg(views[partner][0], views[k][0])
-        if placed is None or apart > options.most_apart_deg:
+        if placed is None or apart > MOST_APART_DEG:
             poses[k] = Pose(partner=k)
             continue
         fixed = dataclasses.replace(placed, carm=poses[partner].applied(placed.carm))
@@ -185,15 +198,15 @@ def _estimate(
     given = Pose(before=before, after=before, landmark_before_mm=gap, landmark_after_mm=gap)
     calibrated = fixed.calibrated and moving.calibrated
     apart = mismatch(fixed, moving, moving.carm, options.fine_mm)
-    if not options.enabled or (calibrated and gap is None and apart <= options.agreed_calibrated):
+    if not options.enabled or (calibrated and gap is None and apart <= AGREED_CALIBRATED):
         return given
-    prior = prior_sigmas(options)
-    root = prior_root(moving.carm, options)
+    prior = prior_sigmas()
+    root = prior_root(moving.carm)
 
     def residuals(theta: Array, sigma_mm: float, noise: float) -> Array:
         carm = corrected(moving.carm, theta)
         a, b = mass_profiles(fixed, moving, carm, sigma_mm)
-        gaps = ray_gaps(fixed.carm, carm, *marks) / options.landmark_sigma_mm
+        gaps = ray_gaps(fixed.carm, carm, *marks) / LANDMARK_MM
         return np.concatenate([(a - b) / (noise * np.sqrt(float(a @ a))), root @ theta, gaps])
 
     def left(theta: Array, sigma_mm: float) -> float:
@@ -201,11 +214,11 @@ def _estimate(
 
     normal = plane_normal(fixed.carm, moving.carm)
     start, best = np.zeros(5), np.inf
-    near = calibrated and apart <= options.profile_noise
-    reach = 0.0 if near else options.search_mm
-    for shift in np.arange(-reach, reach + 1e-9, options.step_mm):
+    near = calibrated and apart <= PROFILE_NOISE
+    reach = 0.0 if near else SEARCH_MM
+    for shift in np.arange(-reach, reach + 1e-9, STEP_MM):
         theta = np.concatenate([shift * normal, np.zeros(2)])
-        r = residuals(theta, options.coarse_mm, options.profile_noise)
+        r = residuals(theta, options.coarse_mm, PROFILE_NOISE)
         if float(r @ r) < best:
             start, best = theta, float(r @ r)
     start = fit_profiles(residuals, left, start, prior, options, calibrated=calibrated)
@@ -215,8 +228,8 @@ def _estimate(
         _gap_mm(fixed.carm, carm, marks),
     )
     marked = gap is not None and gap_after is not None
-    better = marked and (gap_after or 0.0) < options.min_gain * (gap or 0.0)
-    if after > options.min_gain * before and not better:
+    better = marked and (gap_after or 0.0) < MIN_GAIN * (gap or 0.0)
+    if after > MIN_GAIN * before and not better:
         # Not clearly better than the geometry as given: leave it alone.
         return given
     x, y, z, primary, secondary = (float(value) for value in start)

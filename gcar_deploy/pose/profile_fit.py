@@ -16,8 +16,19 @@ from scipy.optimize import least_squares
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.prior import ANGLE_DEG, MAGNIFICATION, OFFSET_MM
 from gcar_deploy.types import Array, Scalars
 
+#: first search along the direction that two views see best, mm
+SEARCH_MM, STEP_MM = 12.0, 1.0
+#: how well two profiles of the same tree agree, as a share of their norm, and how well at best in
+#: calibrated pictures
+PROFILE_NOISE, CALIBRATED_NOISE = 0.05, 0.002
+#: directions further apart than this are not compared: see ``estimate_poses``
+MOST_APART_DEG = 150.0
+#: a correction must lower the disagreement to this share of what it was
+MIN_GAIN = 0.85
+MAX_EVALUATIONS = 40
 #: relative change of the objective or of the pose below which a fit ends
 TOLERANCE = 1e-4
 #: finite differences reach so far, as a share of a parameter's prior
@@ -58,46 +69,44 @@ def fit_profiles(
     def fitted(x: Array, sigma: float, noise: float) -> Array:
         solution = least_squares(
             residuals, x, jac=slopes, args=(sigma, noise), x_scale=prior,
-            ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=options.max_evaluations,
+            ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
         out: Array = np.round(solution.x, DIGITS)
         return out
 
     if not calibrated:
-        x = fitted(start, options.coarse_mm, options.profile_noise)
-        return fitted(x, options.fine_mm, options.profile_noise)
+        x = fitted(start, options.coarse_mm, PROFILE_NOISE)
+        return fitted(x, options.fine_mm, PROFILE_NOISE)
     x, now = start, left(start, options.fine_mm)
-    if now > options.profile_noise:
-        x = fitted(x, options.coarse_mm, options.profile_noise)
+    if now > PROFILE_NOISE:
+        x = fitted(x, options.coarse_mm, PROFILE_NOISE)
         now = left(x, options.fine_mm)
     for _ in range(MOST_FITS):
-        noise = max(TRIAL_SHARE * min(now, options.profile_noise), options.calibrated_noise)
+        noise = max(TRIAL_SHARE * min(now, PROFILE_NOISE), CALIBRATED_NOISE)
         trial = fitted(x, options.fine_mm, noise)
         then = left(trial, options.fine_mm)
-        if then > options.min_gain * now:
+        if then > MIN_GAIN * now:
             break  # what is left is not the pose's
         x, now = trial, then
-        if noise == options.calibrated_noise:
+        if noise == CALIBRATED_NOISE:
             return x
-    return fitted(x, options.fine_mm, max(now, options.calibrated_noise))
+    return fitted(x, options.fine_mm, max(now, CALIBRATED_NOISE))
 
 
-def prior_sigmas(options: PoseOptions) -> Array:
+def prior_sigmas() -> Array:
     """(5,) standard deviations of a view's correction: offset x, y, z in mm, two angles in deg."""
-    return np.array([options.offset_sigma_mm] * 3 + [options.angle_sigma_deg] * 2)
+    return np.array([OFFSET_MM] * 3 + [ANGLE_DEG] * 2)
 
 
-def prior_root(carm: CArm, options: PoseOptions) -> Array:
+def prior_root(carm: CArm) -> Array:
     """(5, 5) W with W theta standard normal under the prior of a view's correction.
 
     A magnification off by a share m shows as a move of m times the source distance along the
     beam, so the prior is wider there: else that part would be made up for by a move across.
     """
     beam = carm.axes[2]
-    along = np.hypot(
-        options.offset_sigma_mm, options.magnification_sigma * np.linalg.norm(carm.source_mm)
-    )
-    W = np.eye(5) / options.angle_sigma_deg
-    W[:3, :3] = np.eye(3) / options.offset_sigma_mm
-    W[:3, :3] += (1.0 / along - 1.0 / options.offset_sigma_mm) * np.outer(beam, beam)
+    along = np.hypot(OFFSET_MM, MAGNIFICATION * np.linalg.norm(carm.source_mm))
+    W = np.eye(5) / ANGLE_DEG
+    W[:3, :3] = np.eye(3) / OFFSET_MM
+    W[:3, :3] += (1.0 / along - 1.0 / OFFSET_MM) * np.outer(beam, beam)
     return W

@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gcar_deploy.config import BundleOptions, RunOptions
+from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import triangulate
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.skeleton import skeletonize
+from gcar_deploy.pose import bundle_adjustment
 from gcar_deploy.pose.bundle_adjustment import adjust
-from gcar_deploy.pose.bundling import bundled
+from gcar_deploy.pose.bundling import LEAST_PX, bundled
 from gcar_deploy.pose.joint import corrected
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.tree.tree import Branch, Tree
@@ -19,7 +20,6 @@ from gcar_deploy.tree.tree import Branch, Tree
 render = pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
 from gcar_export.scenes.trees import random_tree  # noqa: E402
 
-OPTIONS = BundleOptions()
 #: the table went by centimetres between the first and the others
 MOVED = np.array([[0.0, 0, 0], [12, -18, 6], [-9, 14, -11], [6, 10, 15]])
 
@@ -88,7 +88,7 @@ def off_by(count, mm, seed=0):
 def test_views_find_their_place(count):
     told, views, points = scene(count, 4)
     theta = off_by(count, 3.0)
-    found = adjust(wrong_tree(told, theta, points), views, told, theta, OPTIONS)
+    found = adjust(wrong_tree(told, theta, points), views, told, theta)
     assert found.after_mm < 0.5 * found.before_mm
     assert not found.theta[0].any()
     assert miss_mm(told, theta, points) > 0.7
@@ -98,8 +98,8 @@ def test_views_find_their_place(count):
 def test_a_right_pose_stays():
     told, views, points = scene(3, 4)
     theta = off_by(3, 0.0)
-    found = adjust(tree_of(points), views, told, theta, OPTIONS)
-    assert found.before_mm < OPTIONS.least_px * told[0].pixel_at_isocenter_mm
+    found = adjust(tree_of(points), views, told, theta)
+    assert found.before_mm < LEAST_PX * told[0].pixel_at_isocenter_mm
     assert miss_mm(told, found.theta, points) < 0.45
 
 
@@ -114,21 +114,21 @@ def test_gaps_in_the_pictures_do_no_harm():
             skeleton[max(rows[at] - 8, 0) : rows[at] + 8, max(cols[at] - 8, 0) : cols[at] + 8] = 0
         torn.append(dataclasses.replace(view, skeleton=skeleton))
     theta = off_by(4, 3.0)
-    found = adjust(wrong_tree(told, theta, points), torn, told, theta, OPTIONS)
+    found = adjust(wrong_tree(told, theta, points), torn, told, theta)
     assert miss_mm(told, found.theta, points) < 0.6
 
 
-def test_landmarks_hold_where_the_lines_say_little():
+def test_landmarks_hold_where_the_lines_say_little(monkeypatch):
     told, views, points = scene(3, 4)
     theta = off_by(3, 3.0)
     marks = np.stack([np.concatenate(points)[::60]] * 3, axis=1)
     seen = [view.moved(shift) for view, shift in zip(told, MOVED, strict=False)]
     pixels = np.stack([v.project(marks[:, k])[0] for k, v in enumerate(seen)], axis=1)
     pixels[0, 1] = np.nan  # one point that one view does not show
-    faint = dataclasses.replace(OPTIONS, line_sigma_mm=50.0)
+    monkeypatch.setattr(bundle_adjustment, "LINE_MM", 50.0)
     tree = wrong_tree(told, theta, points)
-    alone = adjust(tree, views, told, theta, faint)
-    held = adjust(tree, views, told, theta, faint, pixels)
+    alone = adjust(tree, views, told, theta)
+    held = adjust(tree, views, told, theta, pixels)
     assert miss_mm(told, held.theta, points) < 0.2 * miss_mm(told, alone.theta, points)
 
 
@@ -136,10 +136,10 @@ def test_too_little_to_go_by():
     told, views, points = scene(3, 4)
     theta = off_by(3, 3.0)
     short = tree_of([points[0][:5]])
-    np.testing.assert_array_equal(adjust(short, views, told, theta, OPTIONS).theta, theta)
+    np.testing.assert_array_equal(adjust(short, views, told, theta).theta, theta)
     blank = [dataclasses.replace(v, skeleton=np.zeros_like(v.skeleton)) for v in views]
     tree = wrong_tree(told, theta, points)
-    np.testing.assert_array_equal(adjust(tree, blank, told, theta, OPTIONS).theta, theta)
+    np.testing.assert_array_equal(adjust(tree, blank, told, theta).theta, theta)
 
 
 def test_rounds_of_tree_and_poses():
