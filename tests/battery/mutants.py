@@ -256,8 +256,8 @@ MUTANTS = (
     Mutant(
         "pictures: what is lost in the noise is a vessel",
         "gcar_deploy/imaging/extract.py",
-        "if length < options.min_length_mm or too_faint:",
-        "if length < options.min_length_mm:",
+        "if length < MIN_LENGTH_MM or too_faint:",
+        "if length < MIN_LENGTH_MM:",
         ("tests/imaging/test_extract.py",),
     ),
     Mutant(
