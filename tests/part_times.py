@@ -35,6 +35,8 @@ class PartTimes:
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         """Say it, one line."""
         everything = sum(self.count.values())
+        if not everything:
+            return
         parts = [f"quick part: {self.count['quick']} tests in {self.last['quick']:.0f} s"]
         if self.count["slow"]:
             parts.append(f"all: {everything} tests in {max(self.last.values()):.0f} s")

@@ -61,6 +61,7 @@ def row(kind="same", pictures="raw", disagreement=0.1, coverage=0.95, dsc=0.8, o
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_pairs_are_what_they_are_called(subjects):
     one, two = subjects
     made = {kind: make_pair(one, two, kind, "path length", SEED) for kind in KINDS}

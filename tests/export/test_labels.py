@@ -171,7 +171,9 @@ def test_cropping_keeps_every_voxel_in_place():
     assert small.volume_mm3 == left.volume_mm3
 
 
-@pytest.mark.parametrize("case", ["0001", "0401", "0595"])
+@pytest.mark.parametrize(
+    "case", ["0001", *(pytest.param(c, marks=pytest.mark.slow) for c in ("0401", "0595"))]
+)
 @pytest.mark.parametrize("protocol", ["P", "C"])
 def test_truth_of_the_ready_cases(case, protocol):
     label = read_label(data("imagecas", f"{case}.label.nii.gz"))

@@ -127,7 +127,13 @@ def test_most_of_the_line_is_never_taken_away(monkeypatch):
     assert _found(scene).catheter_mm > 35
 
 
-@pytest.mark.parametrize("scene", ["from above", "in a loop", "zoomed", "side branch"])
+_OTHER_SCENES = ("in a loop", "zoomed", "side branch")
+
+
+@pytest.mark.parametrize(
+    "scene",
+    ["from above", *(pytest.param(s, marks=pytest.mark.slow) for s in _OTHER_SCENES)],
+)
 def test_turned_and_mirrored_pictures_decide_alike(scene):
     tubes = (*_TREE, _CATHETERS[scene]) if scene in _CATHETERS else _LEAVING[scene]
     picture = raw_picture(_tubes(tubes), ramp=0.0)
