@@ -33,9 +33,9 @@ def battery(*arguments: object) -> str:
         ("png", 0.05, "cv2"),
         ("json", 0.05, "json"),
         pytest.param("onnx", 0.05, "onnx", marks=pytest.mark.slow),
-        ("dicom", 0.05, "pydicom"),
+        pytest.param("dicom", 0.05, "pydicom", marks=pytest.mark.slow),
         pytest.param("checkpoint", 0.2, "safetensors", marks=pytest.mark.slow),
-        ("http", 0.05, "flask"),
+        pytest.param("http", 0.05, "flask", marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.req("REQ-45")

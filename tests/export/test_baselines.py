@@ -42,6 +42,7 @@ def pictures(tree, views):
     return [raycast(tree, c) for c in carms], carms
 
 
+@pytest.mark.slow
 def test_visual_hull_contains_the_tree_and_shrinks_with_views(tree):
     hulls = [visual_hull(*pictures(tree, n), GRID) for n in (2, 8)]
     assert (hulls[0] >= hulls[1]).mean() > 0.999

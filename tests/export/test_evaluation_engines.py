@@ -72,6 +72,7 @@ def test_a_dask_cluster_makes_the_same_rows(given, here, tmp_path):
     assert [done for done, *_ in calls] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_missing_is_one_line(given, tmp_path, monkeypatch):
     options = EvaluateOptions(**given, out=tmp_path, engine="dask")
     with pytest.raises(UsageError, match="--scheduler"):

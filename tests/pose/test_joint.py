@@ -40,7 +40,7 @@ def worst_visible_mm(poses, moved):
 
 
 @pytest.mark.parametrize("seed", [4, *(pytest.param(s, marks=pytest.mark.slow) for s in (6, 8))])
-@pytest.mark.parametrize("count", [3, 4])
+@pytest.mark.parametrize("count", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_known_shifts_are_found_where_pairs_alone_miss_them(count, seed, monkeypatch):
     moved = moves(count, seed)
     together = estimate_poses(pictures(moved, seed), PoseOptions())
