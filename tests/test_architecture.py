@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -10,32 +11,36 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "gcar_deploy"
+PACKAGES = {"gcar_deploy": ROOT / "gcar_deploy", "gcar_export": ROOT / "export"}
+PACKAGE = PACKAGES["gcar_deploy"]
 #: from the ground up: a room imports those of lower floors alone; rooms on one floor keep apart
+RUNTIME_FLOORS = (
+    "errors types files",
+    "config stopwatch",
+    "geometry",
+    "models",
+    "imaging",
+    "gaussians dicom",
+    "tree inputs",
+    "predict tubes measure",
+    "quality",
+    "pose",
+    "reconstruction",
+    "output reconstruct selftest data",
+    "result",
+    "engine",
+    "inspection worker batch bench",
+    "cli",
+)
+EXPORT_FLOORS = ("scenes", "training", "shipping methods", "evaluate", "studies", "cli")
 FLOORS = {
-    room: floor
-    for floor, rooms in enumerate(
-        (
-            "errors types files",
-            "config stopwatch",
-            "geometry",
-            "models",
-            "imaging",
-            "gaussians dicom",
-            "tree inputs",
-            "predict tubes measure",
-            "quality",
-            "pose",
-            "reconstruction",
-            "output reconstruct selftest data",
-            "result",
-            "engine",
-            "inspection worker batch bench",
-            "cli",
-        )
-    )
+    (package, room): floor
+    for package, floors in (("gcar_deploy", RUNTIME_FLOORS), ("gcar_export", EXPORT_FLOORS))
+    for floor, rooms in enumerate(floors)
     for room in rooms.split()
 }
+#: rooms that others enter by what their ``__init__`` shows
+FACED = ("models", "predict", "tubes", "quality", "pose")
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load
 HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", "pydicom")
 #: the only files of the runtime that may name these libraries
@@ -56,60 +61,110 @@ WALLED = {
 }
 
 
-def sources() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
+def sources(*packages: str) -> list[Path]:
+    return sorted(p for name in packages for p in PACKAGES[name].rglob("*.py"))
+
+
+RUNTIME = sources("gcar_deploy")
+ALL = sources(*PACKAGES)
+
+
+def package_of(path: Path) -> str:
+    return "gcar_deploy" if PACKAGE in path.parents else "gcar_export"
 
 
 def name_of(path: Path) -> str:
-    return path.relative_to(PACKAGE).as_posix()
+    return path.relative_to(PACKAGES[package_of(path)]).as_posix()
 
 
-def imports(path: Path) -> set[str]:
-    """Full names of all modules that a file imports, also inside functions."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def module_of(path: Path) -> str:
+    inside = path.relative_to(PACKAGES[package_of(path)]).with_suffix("").parts
+    return ".".join((package_of(path), *inside)).removesuffix(".__init__")
+
+
+MODULES = {module_of(path): path for path in ALL}
+
+
+def imports(path: Path, *, typing: bool = True) -> set[str]:
+    """Full names of all that a file imports, also inside functions: modules, or names in them.
+
+    Without ``typing`` what stands under ``if TYPE_CHECKING`` is left out: names in annotations
+    are no dependency.
+    """
+    found, tree = set(), ast.parse(path.read_text(encoding="utf-8"))
+    skipped = {
+        id(child)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test) and not typing
+        for child in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in skipped:
+            continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name_of(path)}: relative import"
-            module = node.module or ""
-            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
     return found
 
 
-def room(path: Path) -> str:
-    parts = path.relative_to(PACKAGE).with_suffix("").parts
-    return parts[0]
+def face_of(room: str) -> set[str]:
+    """Names that a room shows to others; none without an ``__all__``."""
+    for node in ast.parse(MODULES[room].read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return set(ast.literal_eval(node.value))
+    return set()
 
 
-def typing_only(path: Path) -> set[str]:
-    """Modules imported under ``if TYPE_CHECKING``: names in annotations, no dependency."""
+FACES = {name: face_of(name) for name, path in MODULES.items() if path.name == "__init__.py"}
+
+
+def dependencies(path: Path) -> set[str]:
+    """Modules of our own that a file imports."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
-            for child in ast.walk(node):
-                if isinstance(child, ast.ImportFrom) and child.module:
-                    found |= {child.module, *(f"{child.module}.{a.name}" for a in child.names)}
-    return found
+    for name in imports(path, typing=False):
+        if name.startswith(tuple(PACKAGES)):
+            room, _, last = name.rpartition(".")
+            found.add(name if name in MODULES and last not in FACES.get(room, ()) else room)
+    return found - {module_of(path)}
 
 
-@pytest.mark.parametrize("path", sources(), ids=name_of)
+def room_of(module: str) -> tuple[str, str]:
+    package, _, rest = module.partition(".")
+    return package, rest.partition(".")[0]
+
+
+@pytest.mark.parametrize("path", ALL, ids=name_of)
 def test_no_arrow_up(path):
-    own = room(path)
-    if own == "__init__":
+    own = room_of(module_of(path))
+    if not own[1]:
         return
     assert own in FLOORS, f"{own} has no floor: add it to the law on purpose"
-    for module in imports(path) - typing_only(path):
-        parts = module.split(".")
-        if parts[0] != "gcar_deploy" or len(parts) < 2:
-            assert parts[0] not in ("gcar_export", "tests"), f"imports {module}"
-            continue
-        if parts[1] not in FLOORS or parts[1] == own:
-            continue
-        assert FLOORS[parts[1]] < FLOORS[own], f"{name_of(path)} imports {module}"
+    for module in dependencies(path):
+        other = room_of(module)
+        assert own[0] != "gcar_deploy" or other[0] != "gcar_export", f"imports {module}"
+        if other in FLOORS and other[0] == own[0] and other != own:
+            assert FLOORS[other] < FLOORS[own], f"{name_of(path)} imports {module}"
+    assert not any(name.startswith("tests.") for name in imports(path))
 
 
-@pytest.mark.parametrize("path", sources(), ids=name_of)
+@pytest.mark.parametrize("path", RUNTIME, ids=name_of)
+def test_a_room_with_a_face_is_entered_by_it(path):
+    own = room_of(module_of(path))
+    for module in dependencies(path):
+        room = room_of(module)
+        assert room == own or room[1] not in FACED or module == ".".join(room), (
+            f"imports {module}: let the face of {room[1]} show what others use"
+        )
+
+
+def test_no_circles():
+    """Not between the files of a room either: all imports together have an order."""
+    graphlib.TopologicalSorter({module_of(p): dependencies(p) for p in ALL}).prepare()
+
+
+@pytest.mark.parametrize("path", RUNTIME, ids=name_of)
 def test_walled_libraries_stay_in_their_room(path):
     named = {module.split(".")[0] for module in imports(path)}
     for library, homes in WALLED.items():
@@ -117,7 +172,7 @@ def test_walled_libraries_stay_in_their_room(path):
             assert name_of(path) in homes
 
 
-@pytest.mark.parametrize("path", sources(), ids=name_of)
+@pytest.mark.parametrize("path", RUNTIME, ids=name_of)
 def test_files_stay_small_and_quiet(path):
     text = path.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 420
@@ -166,7 +221,7 @@ def test_help_loads_nothing_heavy():
 def test_the_whole_runtime_never_imports_torch():
     modules = [
         "gcar_deploy." + name_of(p)[:-3].replace("/", ".").removesuffix(".__init__")
-        for p in sources()
+        for p in RUNTIME
         if p.name != "__init__.py"
     ]
     code = "import importlib\n" + "\n".join(f"importlib.import_module({m!r})" for m in modules)

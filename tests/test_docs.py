@@ -20,14 +20,14 @@ DOCS = ROOT / "docs"
 def tool():
     sys.path.insert(0, str(ROOT))
     try:
-        from gcar_export.shipping import command_reference
+        from gcar_export.cli import command_reference
     finally:
         sys.path.remove(str(ROOT))
     return command_reference
 
 
 def test_the_command_reference_is_up_to_date(tool):
-    """Otherwise: python -m gcar_export.shipping.command_reference."""
+    """Otherwise: python -m gcar_export.cli.command_reference."""
     assert (DOCS / "commands.md").read_text(encoding="utf-8") == tool.reference()
 
 

@@ -12,9 +12,9 @@ from gcar_deploy.bench.tradeoff import BenchCase
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.metrics import VOLUME_THRESHOLD, skeleton
 from gcar_deploy.types import Volume
-from gcar_export.evaluate.protocols import Case, make_case
 from gcar_export.methods.rtk_timing import pair_carms, projection_pair
 from gcar_export.scenes.labels import read_label
+from gcar_export.scenes.protocols import Case, make_case
 
 #: set-up of the simulated views
 PROTOCOL = "clinical"

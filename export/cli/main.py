@@ -85,8 +85,8 @@ def simulate(label: Path, out: Path, protocol: str, views: int) -> None:
 
     Example: gcar-export simulate data/imagecas/0001.label.nii.gz case --protocol clinical
     """
-    from gcar_export.evaluate.protocols import make_case, write_case
     from gcar_export.scenes.labels import read_label
+    from gcar_export.scenes.protocols import make_case, write_case
 
     if out.exists() and any(out.iterdir()):
         raise UsageError(f"{out} exists and is not empty")
@@ -104,9 +104,9 @@ def pair_time(label: Path, repeats: int) -> None:
 
     Example: gcar-export pair-time data/imagecas/0001.label.nii.gz
     """
-    from gcar_export.evaluate.protocols import make_case
     from gcar_export.methods.rtk_timing import time_pair
     from gcar_export.scenes.labels import read_label
+    from gcar_export.scenes.protocols import make_case
 
     found = time_pair(make_case(read_label(label), "paper"), repeats=repeats)
     click.echo(f"itk-rtk forward {found.forward_s:.4f} s, back {found.back_s:.4f} s")

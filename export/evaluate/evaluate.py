@@ -20,10 +20,10 @@ from gcar_deploy.errors import UsageError
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
 from gcar_export.evaluate.jobs import Job, case_name, row_path, write_done
-from gcar_export.evaluate.protocols import COMMON, PROTOCOLS
-from gcar_export.evaluate.thin_protocol import THIN, thin_names
 from gcar_export.methods.settings import METHODS, MethodSettings
 from gcar_export.methods.solve import check_models
+from gcar_export.scenes.protocols import COMMON, PROTOCOLS
+from gcar_export.scenes.thin_protocol import THIN, thin_names
 
 LOGGER = logging.getLogger(__name__)
 #: where label volumes are looked for below the data folder, in this order.

@@ -24,12 +24,12 @@ from gcar_deploy.measure.metrics import (
     volume_measures,
 )
 from gcar_deploy.types import Array, Volume
-from gcar_export.evaluate.protocols import COMMON, Case, make_case
-from gcar_export.evaluate.thin_protocol import THIN, line_measures, thin_case
 from gcar_export.methods.settings import MethodSettings
 from gcar_export.methods.solve import Solved, solve
 from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.protocols import COMMON, Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
+from gcar_export.scenes.thin_protocol import THIN, line_measures, thin_case
 
 #: name that the truth's own pictures are kept under, beside the methods.
 TRUTH = "truth"

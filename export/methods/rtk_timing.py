@@ -19,8 +19,8 @@ from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Volume
-from gcar_export.evaluate.protocols import PAPER_VOXEL_MM, Case
 from gcar_export.methods import rtk_geometry
+from gcar_export.scenes.protocols import PAPER_VOXEL_MM, Case
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,9 +19,9 @@ from gcar_deploy.errors import GcarError, ModelError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Image, Points, Volume
-from gcar_export.evaluate.protocols import Case
-from gcar_export.evaluate.thin_protocol import along
 from gcar_export.methods.settings import FBP_PAPER, METHODS, RUNTIME_ROWS, MethodSettings
+from gcar_export.scenes.protocols import Case
+from gcar_export.scenes.thin_protocol import along
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.metrics import skeleton
+from gcar_export.scenes.capsules import Capsules, LabelTree
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.render import occupancy
-from gcar_export.training.examinations import Capsules, LabelTree
 
 #: label volumes are thinned at this voxel edge, mm
 VOXEL_MM = 0.5

@@ -15,8 +15,8 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree, polyline_arc
-from gcar_export.evaluate.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import random_tree
 

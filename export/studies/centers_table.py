@@ -19,10 +19,10 @@ from gcar_deploy.predict.encoding import flat_inputs, input_names
 from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
 from gcar_deploy.types import Array
 from gcar_export.evaluate.evaluate import find_labels
-from gcar_export.evaluate.protocols import Case, make_case
 from gcar_export.methods.predictor_process import peak_mib
 from gcar_export.methods.rtk_timing import pair_carms, projection_pair
 from gcar_export.scenes.labels import read_label
+from gcar_export.scenes.protocols import Case, make_case
 from gcar_export.studies.centers import Truth, pose, predicted
 
 #: how near counts, voxels of the protocol's grid (1.41 mm paper, 1 mm clinical)

@@ -34,8 +34,8 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.measure.metrics import VOLUME_THRESHOLD, skeleton
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Image, Points, Volume
-from gcar_export.evaluate.protocols import MM_PER_COUNT, case_geometry
 from gcar_export.scenes.labels import read_label
+from gcar_export.scenes.protocols import MM_PER_COUNT, case_geometry
 from gcar_export.scenes.raw_pictures import RawOptions, raw_picture
 from gcar_export.scenes.raycast import raycast
 from gcar_export.scenes.render import occupancy, path_lengths

@@ -44,7 +44,7 @@ from gcar_deploy.measure.metrics import volume_dice
 from gcar_deploy.pose import agreement
 from gcar_deploy.quality.gates import check_agreement, check_order
 from gcar_deploy.quality.status import DEGRADED, OK, REFUSED, ViewQuality, check_explained
-from gcar_export.evaluate.protocols import case_geometry
+from gcar_export.scenes.protocols import case_geometry
 from gcar_export.studies.gate_pairs import (
     KINDS,
     PICTURES,

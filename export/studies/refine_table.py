@@ -34,9 +34,9 @@ from gcar_deploy.measure.metrics import (
 from gcar_deploy.tubes.refine import refine, refined_volume
 from gcar_deploy.types import Array, Volume
 from gcar_export.evaluate.evaluate import case_name, find_labels
-from gcar_export.evaluate.protocols import Case, make_case
 from gcar_export.evaluate.tables import STARS
 from gcar_export.scenes.labels import read_label
+from gcar_export.scenes.protocols import Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
 
 NOISES = (0.0, 0.5, 1.0, 2.0)

@@ -42,8 +42,8 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.measure.metrics import chamfer_mm, skeleton, volume_dice
 from gcar_deploy.types import Array, Image
 from gcar_export.evaluate.evaluate import find_labels
-from gcar_export.evaluate.protocols import MM_PER_COUNT
 from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.protocols import MM_PER_COUNT
 from gcar_export.scenes.raycast import raycast
 
 CURVES: dict[str, tuple[float, ...]] = {

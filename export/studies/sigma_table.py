@@ -33,7 +33,7 @@ from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import PIXEL_SHARE
 from gcar_deploy.tubes.uncertainty import geometry_sigma
 from gcar_deploy.types import Array
-from gcar_export.evaluate.protocols import MM_PER_COUNT, case_geometry
+from gcar_export.scenes.protocols import MM_PER_COUNT, case_geometry
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import SyntheticTree, random_tree
 

@@ -12,8 +12,8 @@ from gcar_deploy.config import CandidateOptions
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.metrics import skeleton
 from gcar_deploy.predict.hull import visual_hull
-from gcar_export.evaluate.protocols import make_case
 from gcar_export.scenes.labels import from_array, read_label
+from gcar_export.scenes.protocols import make_case
 from gcar_export.scenes.render import occupancy
 from gcar_export.scenes.trees import TreeStyle, random_tree, rough_style, thin_style
 

@@ -18,13 +18,12 @@ from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_deploy.predict.hull import Candidates, visual_hull
 from gcar_deploy.types import Image
+from gcar_export.scenes.capsules import Capsules, LabelTree
 from gcar_export.scenes.pictures import PATH_ERRORS, as_mask, degrade, with_noise
 from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.training.examinations import (
     MAX_POINTS,
-    Capsules,
     Examination,
-    LabelTree,
     SceneOptions,
     examination,
     lattice_of,

@@ -12,6 +12,7 @@ from gcar_deploy.config import CandidateOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.predict.hull import visual_hull
+from gcar_export.scenes.capsules import Capsules, LabelTree
 from gcar_export.scenes.gantry import (
     PAPER_VIEWS,
     USUAL_SPREAD_DEG,
@@ -63,55 +64,6 @@ class SceneOptions:
     more_views_share: float = 0.12
     #: scenes drawn from users' label volumes where some are given
     label_share: float = 0.5
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Capsules:
-    """A tree as capsules: (n, 3) starts and ends in mm LPS, (n,) radii in mm."""
-
-    starts: np.ndarray
-    ends: np.ndarray
-    radii: np.ndarray
-
-    def moved(self, shift_mm: np.ndarray) -> Capsules:
-        """Return the tree moved by (3,) mm."""
-        return Capsules(self.starts + shift_mm, self.ends + shift_mm, self.radii)
-
-    def turned(self, matrix: np.ndarray) -> Capsules:
-        """Return the tree turned (or mirrored) about the isocentre."""
-        return Capsules(self.starts @ matrix.T, self.ends @ matrix.T, self.radii)
-
-    def kept(self, which: np.ndarray) -> Capsules:
-        """Return the capsules chosen by a (n,) bool."""
-        return Capsules(self.starts[which], self.ends[which], self.radii[which])
-
-    @property
-    def reach_mm(self) -> float:
-        """Largest coordinate, mm."""
-        return float(max(np.abs(self.starts).max(), np.abs(self.ends).max()))
-
-    def oval(self, rng: np.random.Generator) -> Capsules:
-        """Return a lumen of oval sections round the same lines, of about the same area."""
-        stretch = rng.uniform(0.1, 0.45)
-        along = self.ends - self.starts
-        # One direction of space keeps the long axis of neighbouring sections alike.
-        across = np.cross(along, rng.normal(size=3))
-        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-        shift = (stretch * self.radii)[:, None] * across
-        radii = self.radii * (1 - 0.55 * stretch)
-        return Capsules(
-            np.concatenate([self.starts - shift, self.starts, self.starts + shift]),
-            np.concatenate([self.ends - shift, self.ends, self.ends + shift]),
-            np.tile(radii, 3),
-        )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class LabelTree:
-    """A user's tree: whole, and its left and right side where the label tells them apart."""
-
-    whole: Capsules
-    sides: tuple[Capsules, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -22,8 +22,9 @@ import torch.distributed
 import torch.multiprocessing
 
 from gcar_deploy.errors import ModelError
+from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training.dataset import TrainingScene, training_scene
-from gcar_export.training.examinations import LabelTree, SceneOptions
+from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.scene_stream import in_order

@@ -18,8 +18,9 @@ import numpy as np
 import torch
 
 from gcar_deploy.predict.center_map import DEPTH_PIXELS, decode
+from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training import losses
-from gcar_export.training.examinations import LabelTree, SceneOptions
+from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.single_dataset import SCENES, VIEWS, TrainingPicture, training_pictures

@@ -20,10 +20,11 @@ from gcar_deploy.predict.center_map import (
     net_picture,
 )
 from gcar_deploy.types import Array
+from gcar_export.scenes.capsules import LabelTree
 from gcar_export.scenes.pictures import degrade
 from gcar_export.scenes.render import path_and_depth
 from gcar_export.training.dataset import picture
-from gcar_export.training.examinations import LabelTree, SceneOptions, examination
+from gcar_export.training.examinations import SceneOptions, examination
 from gcar_export.training.networks.unet import UNetConfig
 
 #: views taken of each drawn tree

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import UsageError
-from gcar_export.training.examinations import LabelTree
+from gcar_export.scenes.capsules import LabelTree
 
 NETWORKS = ("multi", "single")
 

@@ -83,7 +83,7 @@ def processor() -> dict[str, Any]:
 def models() -> list[dict[str, Any]]:
     """Name, hash and golden case of every model that comes along, or why it is unfit."""
     from gcar_deploy.imaging.net import KIND as SEGMENTER
-    from gcar_deploy.predict.kinds import PREDICTORS
+    from gcar_deploy.predict import PREDICTORS
 
     return [_model(kind) for kind in (*PREDICTORS.values(), SEGMENTER)]
 
@@ -91,8 +91,7 @@ def models() -> list[dict[str, Any]]:
 def _model(kind: Kind) -> dict[str, Any]:
     from gcar_deploy.errors import ModelError
     from gcar_deploy.imaging.net import open_segmenter
-    from gcar_deploy.predict.center_predictor import open_predictor
-    from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
+    from gcar_deploy.predict import PREDICTORS, open_predictor, read_predictor
 
     out = {"name": kind.shipped, "sha256": None, "sound": False, "golden": None}
     if kind.path is None:

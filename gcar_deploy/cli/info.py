@@ -27,7 +27,7 @@ def info(path: Path, as_json: bool) -> None:
 
     if path.suffix == ".onnx":
         from gcar_deploy.cli.model_card import card
-        from gcar_deploy.predict.kinds import read_predictor
+        from gcar_deploy.predict import read_predictor
 
         model = read_predictor(path)
         click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))

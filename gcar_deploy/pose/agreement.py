@@ -14,7 +14,7 @@ from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
-from gcar_deploy.quality.gates import check_order, disagreement_limits
+from gcar_deploy.quality import check_order, disagreement_limits
 
 _log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.pose.agreement import agreeing, order_of
 from gcar_deploy.pose.bundling import TreeOf, bundled, posed
 from gcar_deploy.pose.pairwise import Pose
-from gcar_deploy.quality.gates import check_consistency, check_poses, with_hint
+from gcar_deploy.quality import check_consistency, check_poses, with_hint
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

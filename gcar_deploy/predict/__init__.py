@@ -1,6 +1,11 @@
 """Which points are vessel: the hull of all views, networks that know depth, the decision."""
 
-from gcar_deploy.predict.center_predictor import Predictor, load_predictor, missing_predictor
+from gcar_deploy.predict.center_predictor import (
+    Predictor,
+    load_predictor,
+    missing_predictor,
+    open_predictor,
+)
 from gcar_deploy.predict.centers import (
     Centers,
     Evidence,
@@ -9,8 +14,10 @@ from gcar_deploy.predict.centers import (
     quick_tree,
     seen_by_all,
 )
+from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
 
 __all__ = [
+    "PREDICTORS",
     "Centers",
     "Evidence",
     "Predictor",
@@ -18,6 +25,8 @@ __all__ = [
     "find_centers",
     "load_predictor",
     "missing_predictor",
+    "open_predictor",
     "quick_tree",
+    "read_predictor",
     "seen_by_all",
 ]

@@ -14,10 +14,10 @@ from gcar_export.evaluate import engines as evaluation_engines
 from gcar_export.evaluate import evaluate, paper_tables, score
 from gcar_export.evaluate import jobs as evaluation_jobs
 from gcar_export.evaluate import tables as evaluation_tables
-from gcar_export.evaluate.protocols import PROTOCOLS, make_case, write_case
 from gcar_export.methods import solve as methods
 from gcar_export.methods.settings import DESCRIPTIONS, METHODS, MethodSettings
 from gcar_export.scenes.labels import read_label
+from gcar_export.scenes.protocols import PROTOCOLS, make_case, write_case
 from tests.conftest import data_dir
 
 

@@ -11,8 +11,8 @@ from gcar_deploy.config import QualityOptions
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.quality.gates import check_agreement, check_order
-from gcar_export.evaluate.protocols import case_geometry, make_case
 from gcar_export.scenes.labels import read_label
+from gcar_export.scenes.protocols import case_geometry, make_case
 from gcar_export.studies.gate_pairs import (
     KINDS,
     PICTURES,

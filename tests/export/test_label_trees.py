@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
+from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.label_trees import capsules_of, label_tree, read_label_trees
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.raycast import raycast
@@ -18,7 +19,7 @@ from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.training import multi as train_multi
 from gcar_export.training import single as train_single
 from gcar_export.training.dataset import training_scene
-from gcar_export.training.examinations import Capsules, SceneOptions
+from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.single_dataset import training_pictures
 from gcar_export.training.train import start
 

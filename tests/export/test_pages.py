@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gcar_export.evaluate import tables
-from gcar_export.shipping.pages import filled
+from gcar_export.evaluate.pages import filled
 from tests.export.test_evaluate import _row
 
 PAGE = """before

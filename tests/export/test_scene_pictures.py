@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm
+from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.gantry import Field, clinical_views, focused, random_rotation
 from gcar_export.scenes.pictures import PATH_ERRORS, as_mask, spoil, with_noise
 from gcar_export.scenes.render import path_lengths
@@ -15,7 +16,6 @@ from gcar_export.training.examinations import (
     CLINICAL_CELLS_MM,
     FINE_CELLS_MM,
     MAX_POINTS,
-    Capsules,
     SceneOptions,
 )
 

@@ -7,8 +7,8 @@ import pytest
 
 from gcar_deploy.errors import UsageError
 from gcar_export.evaluate.evaluate import EvaluateOptions, evaluate
-from gcar_export.evaluate.protocols import MM_PER_COUNT
-from gcar_export.evaluate.thin_protocol import THIN, along, line_measures, thin_case, thin_names
+from gcar_export.scenes.protocols import MM_PER_COUNT
+from gcar_export.scenes.thin_protocol import THIN, along, line_measures, thin_case, thin_names
 
 
 def test_pictures_show_the_line_with_the_noise_that_is_named() -> None:

@@ -103,7 +103,7 @@ def test_more_views_are_never_worse():
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
     from gcar_deploy.measure.metrics import volume_measures
-    from gcar_export.evaluate.protocols import case_geometry
+    from gcar_export.scenes.protocols import case_geometry
     from gcar_export.scenes.render import occupancy, path_lengths
     from gcar_export.scenes.trees import random_tree
 

@@ -1,6 +1,6 @@
 """Figures of evaluations put into the documents that show them, so that nobody copies by hand.
 
-``python -m gcar_export.shipping.pages RESULTS README.md docs/results.md`` fills every block
+``python -m gcar_export.evaluate.pages RESULTS README.md docs/results.md`` fills every block
 
     <!-- figures: NAME -->
     ...

@@ -1,4 +1,4 @@
-"""docs/commands.md from the commands: ``python -m gcar_export.shipping.command_reference``."""
+"""docs/commands.md from the commands: ``python -m gcar_export.cli.command_reference``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "commands.md"
 _HEAD = """# Commands
 
-Made from the commands by `python -m gcar_export.shipping.command_reference`; do not edit.
+Made from the commands by `python -m gcar_export.cli.command_reference`; do not edit.
 Exit codes are explained in [troubleshooting.md](troubleshooting.md).
 """
 

@@ -19,7 +19,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity, Scene, View
 from gcar_deploy.measure.metrics import Measure
 from gcar_deploy.types import Points
-from gcar_export.evaluate.protocols import MM_PER_COUNT, Case
+from gcar_export.scenes.protocols import MM_PER_COUNT, Case
 from gcar_export.scenes.raycast import as_label
 from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.scenes.trees import random_tree, thin_style
