@@ -22,6 +22,7 @@ from gcar_deploy.output.folder import check_target
 from gcar_deploy.predict import Predictor, load_predictor, missing_predictor
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.result import Result
+from gcar_deploy.steps import OnStep
 from gcar_deploy.stopwatch import OnProgress
 
 _NO_FOLDER = "out is missing: name the folder for the result (--out DIR)"
@@ -118,6 +119,7 @@ class Engine:
         on_progress: OnProgress | None = None,
         deadline_s: float | None = None,
         cancel: Callable[[], bool] | None = None,
+        on_step: OnStep | None = None,
     ) -> Result:
         """Reconstruct one tree.
 
@@ -132,6 +134,7 @@ class Engine:
             it has (``degraded``); CancelledError if there is nothing to refine by then
         cancel : callable, for instance ``threading.Event().is_set``; also asked from another
             thread while the model runs; ends within one step of the refinement
+        on_step : told what each stage hands on, for instance ``output.steps.StepFolder``
 
         Raises
         ------
@@ -139,9 +142,8 @@ class Engine:
         """
         if deadline_s is not None:
             check_number("deadline_s", deadline_s, float, Range(1e-9, 1e9))
-        return self._solve(
-            _Task(views, geometry, masks or {}, self.options, deadline_s), on_progress, cancel
-        )
+        task = _Task(views, geometry, masks or {}, self.options, deadline_s)
+        return self._solve(task, on_progress, cancel, on_step)
 
     def reconstruct_order(
         self,
@@ -150,13 +152,14 @@ class Engine:
         on_progress: OnProgress | None = None,
         cancel: Callable[[], bool] | None = None,
         limit_s: float | None = None,
+        on_step: OnStep | None = None,
     ) -> Result:
         """Reconstruct the tree of an order; what it leaves open is as this engine was set up.
 
         Parameters
         ----------
         order : Order; ``deliver`` does what it says of the result
-        on_progress, cancel : as ``reconstruct``
+        on_progress, cancel, on_step : as ``reconstruct``
         limit_s : the longest deadline that is granted
 
         Raises
@@ -168,10 +171,14 @@ class Engine:
         options = order.options(self.options)
         deadline_s = min(limits, default=None)
         task = _Task(order.views, order.geometry, order.masks, options, deadline_s)
-        return self._solve(task, on_progress, cancel)
+        return self._solve(task, on_progress, cancel, on_step)
 
     def _solve(
-        self, task: _Task, on_progress: OnProgress | None, cancel: Callable[[], bool] | None
+        self,
+        task: _Task,
+        on_progress: OnProgress | None,
+        cancel: Callable[[], bool] | None,
+        on_step: OnStep | None,
     ) -> Result:
         started = time.perf_counter()
         options = task.options
@@ -189,6 +196,7 @@ class Engine:
             deadline_s=task.deadline_s,
             cancel=cancel,
             used_s=time.perf_counter() - started,
+            on_step=on_step,
         )
         return Result.of(found, (*notes, *missing, *found.notes))
 

@@ -21,11 +21,11 @@ from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
 from gcar_deploy.imaging.net import load_segmenter
+from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, load_predictor, quick_tree
 from gcar_deploy.quality import check_views
-from gcar_deploy.reconstruct import in_own_frame
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.tree import Tree
 
@@ -150,7 +150,8 @@ def _registered(
                 pair["disagreement"] = pose.before
                 pair["shift_mm"] = pose.shift_mm
                 pair["after_shift"] = pose.after
-    return list(placed.or_refuse().findings)
+    placed.or_refuse()
+    return list(placed.findings)
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:

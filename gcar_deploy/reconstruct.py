@@ -7,21 +7,22 @@ the pictures -> tree, volume -> quality
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import UsageError
-from gcar_deploy.geometry.frame import OwnFrame, own_frame
+from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.vessels import find_vessels
 from gcar_deploy.measure import from_inlets
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import check_candidates, check_tree, check_views, judge
 from gcar_deploy.reconstruction import Reconstruction
+from gcar_deploy.steps import OnStep, Step
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes import refine, refined_volume
@@ -44,6 +45,7 @@ def reconstruct(
     deadline_s: float | None = None,
     cancel: Callable[[], bool] | None = None,
     used_s: float = 0.0,
+    on_step: OnStep | None = None,
 ) -> Reconstruction:
     """Reconstruct the coronary tree that all views show.
 
@@ -58,6 +60,7 @@ def reconstruct(
     deadline_s : seconds after which the refinement ends with what it has
     cancel : called often, also from another thread; True ends the work with CancelledError
     used_s : seconds that reading the pictures took, part of the deadline and of ``total``
+    on_step : told what each stage hands on
 
     Raises
     ------
@@ -76,44 +79,10 @@ def reconstruct(
                       used_s=used_s)  # fmt: skip
     frame = own_frame([a.carm for a in angiograms], [a.sha256 for a in angiograms])
     seen, asked = in_own_frame(frame, angiograms, options)
-    found = _reconstructed(seen, frame.grid(grid), asked, (predictor, segmenter), watch)
-    return _as_told(found, frame, angiograms, grid, options)
-
-
-def in_own_frame(
-    frame: OwnFrame, angiograms: Sequence[Angiogram], options: RunOptions
-) -> tuple[list[Angiogram], RunOptions]:
-    """Return pictures and landmarks in the scene's own order, the views in its coordinates."""
-    seen = [
-        dataclasses.replace(angiograms[k], carm=frame.carm(angiograms[k].carm)) for k in frame.order
-    ]
-    marks = tuple(tuple(mark[k] for k in frame.order) for mark in options.landmarks)
-    return seen, dataclasses.replace(options, landmarks=marks)
-
-
-def _as_told(
-    found: Reconstruction, frame: OwnFrame, angiograms: Sequence[Angiogram], grid: Grid,
-    options: RunOptions,
-) -> Reconstruction:  # fmt: skip
-    """Return the result in the coordinates and in the order that the scene was given in."""
-    places = [frame.place(k) for k in range(len(angiograms))]
-    poses = tuple(
-        dataclasses.replace(found.poses[p], partner=frame.order[found.poses[p].partner])
-        for p in places
-    )
-    views = tuple(
-        dataclasses.replace(found.views[p], carm=pose.applied(angiogram.carm))
-        for p, pose, angiogram in zip(places, poses, angiograms, strict=True)
-    )
-    judged = tuple(found.quality.views[p] for p in places)
-    means = found.gaussians.means_mm + frame.origin_mm
-    return dataclasses.replace(
-        found,
-        quality=dataclasses.replace(found.quality, views=judged),
-        tree=found.tree.moved(frame.origin_mm),
-        gaussians=dataclasses.replace(found.gaussians, means_mm=means),
-        grid=grid, angiograms=tuple(angiograms), views=views, poses=poses, options=options,
-    )  # fmt: skip
+    keep = on_step or _nothing
+    keep(frame)
+    found = _reconstructed(seen, frame.grid(grid), asked, (predictor, segmenter), watch, keep)
+    return found.as_told(frame, angiograms, grid, options)
 
 
 def _reconstructed(
@@ -122,6 +91,7 @@ def _reconstructed(
     options: RunOptions,
     models: tuple[Predictor | None, Segmenter | None],
     watch: Stopwatch,
+    keep: OnStep,
 ) -> Reconstruction:
     """Reconstruct a scene that stands in its own frame."""
     predictor, segmenter = models
@@ -132,17 +102,23 @@ def _reconstructed(
     findings = check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
         vessels = find_vessels(angiograms, options.imaging, segmenter, watch, report)
+        keep(vessels)
     with watch.stage("pose"):
-        placed = register(angiograms, vessels.views, options, tree_of).or_refuse()
+        placed = register(angiograms, vessels.views, options, tree_of)
+        keep(placed)
+        placed.or_refuse()
     with watch.stage("candidates"), placed.hinting():
         seen = seen_by_all(placed.views, grid, options, predictor)
+        keep(seen)
         check_candidates(len(seen.hull), seen.hull.lattice, options.quality)
     with watch.stage("centers"):
         centers = find_centers(seen, predictor, options, watch)
+        keep(centers)
     with watch.stage("refine") as report:
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(),
         ).or_fail()  # fmt: skip
+        keep(refined)
     with watch.stage("tree", keep_if_late=True):
         check_tree(refined.tree, options.quality)
         volume = refined_volume(refined, placed.views, grid, options.refine)
@@ -168,3 +144,7 @@ def _reconstructed(
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
         notes=(), options=options,
     )  # fmt: skip
+
+
+def _nothing(step: Step) -> None:
+    """Keep no step."""

@@ -7,15 +7,16 @@ import dataclasses
 import functools
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import EXACT_DISAGREEMENT, silent_errors
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
@@ -111,6 +112,35 @@ class Reconstruction:
     def names(self) -> tuple[BranchName | None, ...]:
         """Name of each branch (LM, LAD, LCx, RCA) with its probability; None: a number only."""
         return self.measured.names
+
+    def as_told(
+        self, frame: OwnFrame, angiograms: Sequence[Angiogram], grid: Grid, options: RunOptions
+    ) -> Self:
+        """Return what was found in the scene's own frame as the scene was given.
+
+        Parameters
+        ----------
+        frame : OwnFrame
+        angiograms, grid, options : in the coordinates and the order that they were given in
+        """
+        places = [frame.place(k) for k in range(len(angiograms))]
+        poses = tuple(
+            dataclasses.replace(self.poses[p], partner=frame.order[self.poses[p].partner])
+            for p in places
+        )
+        views = tuple(
+            dataclasses.replace(self.views[p], carm=pose.applied(angiogram.carm))
+            for p, pose, angiogram in zip(places, poses, angiograms, strict=True)
+        )
+        judged = tuple(self.quality.views[p] for p in places)
+        means = self.gaussians.means_mm + frame.origin_mm
+        return dataclasses.replace(
+            self,
+            quality=dataclasses.replace(self.quality, views=judged),
+            tree=self.tree.moved(frame.origin_mm),
+            gaussians=dataclasses.replace(self.gaussians, means_mm=means),
+            grid=grid, angiograms=tuple(angiograms), views=views, poses=poses, options=options,
+        )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""

@@ -40,11 +40,10 @@ class Registered:
         """Worst disagreement of a view with its partner after the corrections, 0 .. 1."""
         return max(pose.after for pose in self.poses)
 
-    def or_refuse(self) -> Registered:
-        """Return itself; raise RefusedError where the views contradict each other."""
+    def or_refuse(self) -> None:
+        """Raise RefusedError where the views contradict each other."""
         if self.refusal:
             raise RefusedError(self.refusal)
-        return self
 
     def hinting(self) -> contextlib.AbstractContextManager[None]:
         """Let a refusal of a later stage say the hint as well."""
