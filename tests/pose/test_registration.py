@@ -1,0 +1,53 @@
+"""Registration: what views that show one tree, or do not, are told before there is any tree."""
+
+import dataclasses
+
+import pytest
+
+from gcar_deploy.config import PoseOptions, RunOptions
+from gcar_deploy.errors import RefusedError
+from gcar_deploy.pose import register
+from tests.pose.test_agreement import pair
+
+OPTIONS = RunOptions()
+
+
+def never(_):
+    raise AssertionError("two views are placed without a tree")
+
+
+def test_views_of_one_tree_stay_where_they_are():
+    angiograms, views = pair(calibrated=True)
+    placed = register(angiograms, views, OPTIONS, never)
+    placed.or_refuse()
+    assert (placed.findings, placed.hint, placed.refusal) == ((), "", "")
+    assert placed.disagreement == placed.poses[1].after < OPTIONS.quality.good_disagreement
+    assert [view.carm for view in placed.views] == [view.carm for view in views]
+
+
+def test_a_move_between_the_runs_is_built_into_the_views_and_said():
+    angiograms, views = pair(calibrated=True)
+    told = dataclasses.replace(views[1], carm=views[1].carm.moved((0.0, 0.0, 9.0)))
+    placed = register(angiograms, [views[0], told], OPTIONS, never)
+    (said,) = placed.findings
+    assert "had to be moved" in said and placed.refusal == ""
+    assert placed.views[1].carm == placed.poses[1].applied(told.carm) != told.carm
+    assert placed.views[0] is views[0]
+
+
+def test_two_trees_are_refused_when_asked_with_what_was_measured():
+    angiograms, views = pair(seeds=(4, 9), calibrated=True)
+    placed = register(angiograms, views, OPTIONS, never)
+    assert placed.disagreement > OPTIONS.quality.max_disagreement
+    with pytest.raises(RefusedError, match="contradict"):
+        placed.or_refuse()
+
+
+def test_a_refusal_says_that_the_pictures_may_be_swapped():
+    angiograms, (one, two) = pair(calibrated=True)
+    given = [dataclasses.replace(two, carm=one.carm), dataclasses.replace(one, carm=two.carm)]
+    options = dataclasses.replace(OPTIONS, pose=PoseOptions(enabled=False))
+    placed = register(angiograms, given, options, never)
+    assert "contradict" in placed.refusal and "swapped?" in placed.refusal
+    with pytest.raises(RefusedError, match=r"no tree.*swapped"), placed.hinting():
+        raise RefusedError("no tree")
