@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, talk_options
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, READING, order_options
 from gcar_deploy.inputs.order import Order, check_views, order_to_json
+
+if TYPE_CHECKING:
+    from gcar_deploy.steps import OnStep
 
 
 @click.command("run")
@@ -19,9 +22,17 @@ from gcar_deploy.inputs.order import Order, check_views, order_to_json
 )
 @order_options("out", *METHOD, *READING, "strict", "force", *EXTRA_FILES, "file")
 @click.option("--print-order", is_flag=True, help="Print the order as JSON and do nothing else.")
+@click.option(
+    "--keep-steps",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="New folder for what every stage made: pictures and VTP.",
+)
 @engine_options
 @talk_options()
-def run(order: Order, engine: EngineChoice, talk: Talk, print_order: bool) -> None:
+def run(
+    order: Order, engine: EngineChoice, talk: Talk, print_order: bool, keep_steps: Path | None
+) -> None:
     """Reconstruct a coronary tree from two or more pictures (PNG, TIFF, NPY, DICOM XA).
 
     Pictures stand in the order of the views in the geometry file; DICOM runs need none. All that
@@ -43,16 +54,26 @@ def run(order: Order, engine: EngineChoice, talk: Talk, print_order: bool) -> No
     engine.limit_threads()
     from gcar_deploy.engine import check_target_of, deliver
 
-    check_target_of(order)
+    out = check_target_of(order)
+    on_step = None if keep_steps is None else _step_folder(keep_steps, out)
     with talk.refusals():
         with talk.bar() as bar:
-            result = engine.engine(order).reconstruct_order(order, on_progress=bar)
+            result = engine.engine(order).reconstruct_order(order, on_progress=bar, on_step=on_step)
         talk.note(result.notes)
         folder = deliver(result, order)
     if talk.as_json:
         click.echo(json.dumps({"out": str(folder), **result.summary()}, allow_nan=False))
     else:
         click.echo("\n".join(summary_lines(result, folder)))
+
+
+def _step_folder(folder: Path, out: Path) -> OnStep:
+    from gcar_deploy.errors import UsageError
+    from gcar_deploy.output.steps import StepFolder
+
+    if out.resolve() in (folder.resolve(), *folder.resolve().parents):
+        raise UsageError(f"--keep-steps {folder} lies in --out; name a folder beside it")
+    return StepFolder(folder)
 
 
 def summary_lines(result: Any, out_dir: Path) -> list[str]:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from gcar_deploy.cli.main import gcar
 from gcar_deploy.config import PredictOptions, QualityOptions, RunOptions
+from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.output.steps import PATH_COUNT_MM, StepFolder
@@ -25,7 +29,7 @@ def kept(tmp_path_factory):
     folder = tmp_path_factory.mktemp("steps") / "new" / "steps"
     angiograms, grid, _ = tiny_case()
     engine = Engine(options=OPTIONS)
-    with_steps = engine.reconstruct(angiograms, grid, on_step=StepFolder(folder, OPTIONS))
+    with_steps = engine.reconstruct(angiograms, grid, on_step=StepFolder(folder))
     return folder, with_steps, engine.reconstruct(angiograms, grid)
 
 
@@ -95,7 +99,7 @@ def test_beams_run_from_the_sources_through_the_isocentre(kept):
 def test_what_came_before_a_refusal_is_kept(tmp_path):
     angiograms, grid, _ = tiny_case()
     options = dataclasses.replace(OPTIONS, quality=QualityOptions(max_disagreement=-1.0))
-    keep = StepFolder(tmp_path / "steps", options)
+    keep = StepFolder(tmp_path / "steps")
     with pytest.raises(RefusedError, match="contradict"):
         Engine(options=options).reconstruct(angiograms, grid, on_step=keep)
     assert sorted(p.name for p in (tmp_path / "steps").iterdir()) == sorted([*VIEWS, *PLACED])
@@ -104,5 +108,18 @@ def test_what_came_before_a_refusal_is_kept(tmp_path):
 def test_a_folder_that_exists_is_left_alone(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(UsageError, match="exists"):
-        StepFolder(tmp_path, OPTIONS)
+        StepFolder(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_gcar_run_keeps_them_beside_the_result(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    case = demo_case()
+    run = ["run", *map(str, case.pictures), "--geom", str(case.geometry), "--predictor", "none",
+           "--refiner", "none", "--quiet", "--out", "out", "--keep-steps"]  # fmt: skip
+    inside = CliRunner().invoke(gcar, [*run, "out/steps"])
+    assert isinstance(inside.exception, UsageError) and "lies in --out" in str(inside.exception)
+    assert not list(tmp_path.iterdir())
+    assert CliRunner().invoke(gcar, [*run, "steps"]).exit_code == 0
+    assert {"5-tree-after.vtp", "1-vessels-view2-mask.png"} <= set(os.listdir("steps"))
+    assert (tmp_path / "out" / "result.json").is_file()
