@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
-import struct
 import zipfile
 from collections.abc import Mapping, Sequence
 
@@ -13,6 +11,7 @@ import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.measure import Measured
+from gcar_deploy.output.vtp import poly_data
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
 
@@ -21,7 +20,6 @@ _SH0 = 0.28209479177387814
 _RED = (0.86, 0.16, 0.16)
 #: a viewer's opacity is a share; outside these its logit is no use
 _OPACITY_RANGE = (0.01, 0.99)
-_VTK_TYPES = {"float64": "Float64", "float32": "Float32", "int64": "Int64", "int32": "Int32"}
 
 
 def npz_bytes(arrays: Mapping[str, Array | str | float]) -> bytes:
@@ -91,7 +89,7 @@ def centerline_vtp(tree: Tree, measured: Measured) -> bytes:
         "Sigma": _of_points(tree, "sigma_mm"),
         "Confidence": _of_points(tree, "confidence"),
     }
-    cell_data = {
+    cell_data: dict[str, Array | Sequence[str]] = {
         "BranchId": np.arange(1, len(sizes) + 1, dtype=np.int64),
         "StartNode": np.array([branch.start for branch in tree.branches], dtype=np.int64),
         "EndNode": np.array([branch.end for branch in tree.branches], dtype=np.int64),
@@ -102,33 +100,9 @@ def centerline_vtp(tree: Tree, measured: Measured) -> bytes:
         "LesionLength": _of_lumens(measured, "lesion_length_mm"),
     }
     told = _told(measured)
-    count = int(sum(sizes))
-    out = [
-        '<?xml version="1.0"?>',
-        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32">',
-        "<PolyData>",
-        f'<Piece NumberOfPoints="{count}" NumberOfVerts="0" NumberOfLines="{len(sizes)}" '
-        'NumberOfStrips="0" NumberOfPolys="0">',
-        '<PointData Scalars="MaximumInscribedSphereRadius">',
-        *(_data_array(name, values) for name, values in point_data.items()),
-        "</PointData>",
-        "<CellData>",
-        *(_data_array(name, values) for name, values in cell_data.items()),
-        _data_array("NameConfidence", np.array([share for _, share in told], dtype=np.float64)),
-        _text_array("VesselName", [name for name, _ in told]),
-        "</CellData>",
-        "<Points>",
-        _data_array("Points", tree.points().reshape(-1, 3), components=3),
-        "</Points>",
-        "<Lines>",
-        _data_array("connectivity", np.arange(count, dtype=np.int64)),
-        _data_array("offsets", np.cumsum(np.asarray(sizes, dtype=np.int64))),
-        "</Lines>",
-        "</Piece>",
-        "</PolyData>",
-        "</VTKFile>",
-    ]
-    return ("\n".join(out) + "\n").encode("ascii")
+    cell_data["NameConfidence"] = np.array([share for _, share in told], dtype=np.float64)
+    cell_data["VesselName"] = [name for name, _ in told]
+    return poly_data(tree.points(), sizes, point_data, cell_data)
 
 
 def centerline_csv(tree: Tree, measured: Measured) -> bytes:
@@ -159,15 +133,6 @@ def _told(measured: Measured) -> list[tuple[str, float]]:
     ]
 
 
-def _text_array(name: str, values: Sequence[str]) -> str:
-    """Texts as VTK writes them: codes of the characters, each text ended by 0."""
-    codes = " ".join(str(code) for text in values for code in (*text.encode("ascii"), 0))
-    return (
-        f'<Array type="String" Name="{name}" NumberOfTuples="{len(values)}" format="ascii">'
-        f"{codes}</Array>"
-    )
-
-
 def _of_points(tree: Tree, name: str) -> Array:
     parts: Sequence[Array] = [getattr(branch, name) for branch in tree.branches]
     return np.concatenate(parts) if parts else np.zeros(0)
@@ -181,15 +146,3 @@ def _of_lumens(measured: Measured, name: str) -> Array:
 
 def _field(value: float) -> str:
     return f"{value:.5f}" if np.isfinite(value) else ""
-
-
-def _data_array(name: str, values: Array, components: int = 1) -> str:
-    """Inline base64 block: its size in bytes as uint32, then the values."""
-    # Binary because VTK's text reader stops at "nan", the value of an unknown sigma.
-    raw = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<")).tobytes()
-    text = base64.b64encode(struct.pack("<I", len(raw)) + raw).decode("ascii")
-    kind = _VTK_TYPES[values.dtype.newbyteorder("=").name]
-    return (
-        f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" '
-        f'format="binary">{text}</DataArray>'
-    )
