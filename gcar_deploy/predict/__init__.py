@@ -14,6 +14,7 @@ from gcar_deploy.predict.centers import (
     quick_tree,
     seen_by_all,
 )
+from gcar_deploy.predict.hull import bilinear
 from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Evidence",
     "Predictor",
     "Seen",
+    "bilinear",
     "find_centers",
     "load_predictor",
     "missing_predictor",

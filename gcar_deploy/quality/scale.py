@@ -16,7 +16,7 @@ import numpy as np
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.predict.hull import bilinear
+from gcar_deploy.predict import bilinear
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
