@@ -25,7 +25,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import TreeOptions
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.imaging.angiogram import VesselImage
@@ -51,7 +50,6 @@ class StepFolder:
     Parameters
     ----------
     folder : Path that does not exist
-    options : TreeOptions of the reconstruction, by which the tree before the refinement is made
 
     Raises
     ------
@@ -61,9 +59,9 @@ class StepFolder:
         The disk refused, at once or at a later step.
     """
 
-    def __init__(self, folder: Path, options: TreeOptions | None = None) -> None:
+    def __init__(self, folder: Path) -> None:
         check_target(folder, force=False)
-        self._folder, self._options = folder, options
+        self._folder = folder
         self._origin_mm: Points = np.zeros(3)
         try:
             folder.mkdir(parents=True)
@@ -104,7 +102,7 @@ class StepFolder:
             points = step.points.points_mm + self._origin_mm
             yield "4-points.vtp", poly_data(points, None, data, {})
         elif not isinstance(step, OwnFrame):
-            before = build_tree(step.centers, self._options)
+            before = build_tree(step.centers)
             yield "5-tree-before.vtp", _lines(before.moved(self._origin_mm))
             yield "5-tree-after.vtp", _lines(step.tree.moved(self._origin_mm))
 
