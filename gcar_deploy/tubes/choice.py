@@ -8,15 +8,18 @@ if it were alone, the shares a of
 
 go to 0 for ghosts and to 1 for vessels. The cost per mm grows as the starting points' confidence
 falls (and is a reward where it is high): evidence decides where the pictures leave two ways open.
+
+Where paths are estimates, a drop that tears a tree apart must be worth it (``wanted_parts``).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.optimize import minimize
+from scipy.optimize import linprog, minimize
 
 from gcar_deploy.tree.edit import kept_branches, part_of
 from gcar_deploy.tree.tree import Branch, Tree
@@ -27,6 +30,9 @@ from gcar_deploy.types import Array, Scalars
 
 #: branches are judged in pieces of at most this length, mm
 PIECE_MM = 100.0
+#: where paths are estimates, a part of the tree that hangs on no other must be worth so many mm,
+#: each weighed by its share less ``MIN_SHARE``; on generated trees 8 and 15 choose alike
+PART_MM = 8.0
 #: cost of a mm of piece per confidence below ``FAIR_CONFIDENCE``, units of the objective
 PIECE_COST = 20.0
 FAIR_CONFIDENCE = 0.4
@@ -106,8 +112,8 @@ def weigh_pieces(
     targets: list[Target],
 ) -> Pieces:
     """Cut the branches into pieces and solve for their shares."""
-    segment = _piece_of_segment(tree, tubes, PIECE_MM)
-    count = int(segment.max()) + 1
+    segment, joints = _cut(tree, tubes, PIECE_MM)
+    count = len(joints)
     points = tubes.points_mm
     length = np.linalg.norm(points[tubes.second] - points[tubes.first], axis=1)
     total: Scalars = np.bincount(segment, length, minlength=count).astype(np.float64)
@@ -127,7 +133,43 @@ def weigh_pieces(
         # The level of confidence depends on the predictor; ghosts stand out below its usual.
         usual = _weighted_median(confidence[kept], total[kept])
         share = np.where(confidence >= TRUSTED_SHARE * usual, 1.0, share)
+    if not all(target.calibrated for target in targets):
+        share = wanted_parts((share - MIN_SHARE) * total, joints, PART_MM).astype(np.float64)
     return Pieces(segment, total, confidence, share)
+
+
+def wanted_parts(gain: Scalars, joints: Array, part_cost: float) -> Array:
+    """Choose the pieces of greatest gain, less a price for every connected part of the choice.
+
+    In a forest the parts are the joints in use less the pieces kept. So each piece earns its gain
+    and the price back, each joint in use costs the price once: a closure problem, whose linear
+    programme has a solution in whole numbers (Picard 1976).
+
+    Parameters
+    ----------
+    gain : (k,) of keeping each piece, below 0 where it is not wanted
+    joints : (k, 2) int, what each piece's ends hang on; the graph has no loops
+    part_cost : price of a part, in the unit of the gain
+
+    Returns
+    -------
+    (k,) bool, kept
+    """
+    count = len(gain)
+    used, end = np.unique(joints, return_inverse=True)
+    # A piece is kept only with both its joints: piece - joint <= 0.
+    needs = sparse.hstack(
+        [
+            sparse.csr_matrix(np.repeat(np.eye(count), 2, axis=0)),
+            sparse.csr_matrix((-np.ones(2 * count), (np.arange(2 * count), end.reshape(-1)))),
+        ]
+    )
+    found = linprog(
+        np.concatenate([-(gain + part_cost), np.full(len(used), part_cost)]),
+        A_ub=needs, b_ub=np.zeros(2 * count), bounds=(0, 1), method="highs",
+    )  # fmt: skip
+    kept: Array = found.x[:count] > 0.5
+    return kept
 
 
 def radius_alone(tubes: Tubes, targets: list[Target]) -> Scalars:
@@ -156,17 +198,20 @@ def radius_alone(tubes: Tubes, targets: list[Target]) -> Scalars:
     return np.clip(smooth, *ALONE_BOUNDS_MM)
 
 
-def _piece_of_segment(tree: Tree, tubes: Tubes, piece_mm: float) -> Array:
+def _cut(tree: Tree, tubes: Tubes, piece_mm: float) -> tuple[Array, Array]:
+    """Piece of each segment (s,), and the joints (k, 2) that the pieces' ends hang on."""
     out = np.zeros(len(tubes.first), np.int64)
-    used = 0
+    joints: list[tuple[int, int]] = []
+    new = len(tree.nodes_mm)
     for k, branch in enumerate(tree.branches):
         own = tubes.branch == k
         middle = 0.5 * (branch.arc_mm[1:] + branch.arc_mm[:-1])
         pieces = max(int(np.ceil(branch.length_mm / piece_mm)), 1)
         share = middle / max(branch.length_mm, 1e-9)
-        out[own] = used + np.minimum((share * pieces).astype(np.int64), pieces - 1)
-        used += pieces
-    return out
+        out[own] = len(joints) + np.minimum((share * pieces).astype(np.int64), pieces - 1)
+        joints += itertools.pairwise([branch.start, *range(new, new + pieces - 1), branch.end])
+        new += pieces - 1
+    return out, np.array(joints)
 
 
 def _normal(tubes: Tubes, piece: Array, count: int, targets: list[Target]) -> tuple[Array, Scalars]:
