@@ -4,7 +4,8 @@ Across a round vessel of radius r, tilted by an angle t against the ray, the pat
 ``2 sqrt(r^2 - x^2) / sin t``: its integral over x is ``pi r^2 / sin t``, its variance ``r^2 / 4``.
 The first hangs on millimetres per count, the second on millimetres per pixel alone, so their
 ratio is the factor between the two. Neither the tree's radii nor a threshold takes part, only its
-course.
+course. A blurred picture has wider shadows and the same integral, which looks like paths too short;
+but blur adds the same variance to thin and to thick vessels, a wrong scale a share of it.
 """
 
 from __future__ import annotations
@@ -34,8 +35,12 @@ _LEAST_PROFILES = 25
 #: 0.4 mm, three real ones 0.90 to 0.96 (their lumens are wider than deep in those views). Where
 #: pixels are as wide as vessels, neighbours merge: 0.64 to 1.25, real ones 0.97 to 1.08
 _TOLERANCE, _TOLERANCE_COARSE, _COARSE_MM = 1.2, 1.6, 0.8
-#: from here on a fine picture cannot be what its calibration says
+#: and below 1, where soft edges can look like it: one tree of soft voxels has 0.70 in both views
+_SHORT = 0.6
+#: from here on paths are too long for any vessel in a picture that is not coarse
 _REFUSED = 1.5
+#: thick vessels need so many times the section of thin ones to tell blur from scale
+_LEAST_RANGE = 2.0
 
 
 def check_scale(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
@@ -48,7 +53,7 @@ def check_scale(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
     Raises
     ------
     RefusedError
-        Paths are longer or shorter than the shadow's width by half, in a picture that shows it.
+        Paths are longer by half than the shadows' width allows, in a picture that shows it.
     """
     findings = []
     for view in views:
@@ -56,14 +61,14 @@ def check_scale(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
         if factor is None:
             continue
         coarse = view.carm.pixel_at_isocenter_mm > _COARSE_MM
-        off = max(factor, 1 / max(factor, 1e-6))
-        if off <= (_TOLERANCE_COARSE if coarse else _TOLERANCE):
+        most = _TOLERANCE_COARSE if coarse else _TOLERANCE
+        if (coarse or factor >= _SHORT) and factor <= most:
             continue
         said = (
             f"view {view.view_id}: path lengths are {factor:.2f} times what the width of the "
             "vessels' shadows says; is mm_per_count or the pixel spacing off by that factor?"
         )
-        if off > _REFUSED and not coarse:
+        if factor > _REFUSED and not coarse:
             raise RefusedError(said)
         findings.append(said)
     return findings
@@ -79,15 +84,30 @@ def scale_factor(tree: Tree, view: VesselImage) -> float | None:
 
     Returns
     -------
-    float, 1 where both agree; None where too few vessels stand alone in the picture
+    float, 1 where both agree; None where too few vessels stand alone in the picture, or where it
+    looks below 1 and all are of one calibre: blur would look the same
     """
-    found = [_factors(branch, view) for branch in tree.branches if len(branch) > 2]
-    factors = np.concatenate(found) if found else np.zeros(0)
-    return float(np.median(factors)) if len(factors) >= _LEAST_PROFILES else None
+    found = [_sections(branch, view) for branch in tree.branches if len(branch) > 2]
+    told, shown = np.concatenate(found, axis=1) if found else np.zeros((2, 0))
+    if len(told) < _LEAST_PROFILES:
+        return None
+    plain = float(np.median(told / shown))
+    return plain if plain >= 1 else _without_blur(told, shown, plain)
 
 
-def _factors(branch: Branch, view: VesselImage) -> Scalars:
-    """(k,) factor of every point of a branch whose shadow stands alone."""
+def _without_blur(told: Scalars, shown: Scalars, plain: float) -> float | None:
+    """Factor from how variances grow from thin to thick vessels; None where all are alike."""
+    thin, thick = (told <= np.quantile(told, 1 / 3)), (told >= np.quantile(told, 2 / 3))
+    x, y = (np.array([np.median(v[thin]), np.median(v[thick])]) for v in (told, shown))
+    if x[1] < _LEAST_RANGE * x[0] or not y[1] > y[0]:
+        return None
+    grown = float((x[1] - x[0]) / (y[1] - y[0]))
+    # Blur adds variance; where none is left over, widths may be taken as they are.
+    return plain if y[0] <= x[0] / grown else max(plain, min(grown, 1.0))
+
+
+def _sections(branch: Branch, view: VesselImage) -> Array:
+    """(2, k) variance, mm^2, of each shadow that stands alone: by its integral, by its shape."""
     pixels, depth = view.carm.project(branch.points_mm)
     size_mm = _pixel_mm(view.carm) * depth / view.carm.sdd_mm
     along = np.gradient(pixels, axis=0)
@@ -104,8 +124,9 @@ def _factors(branch: Branch, view: VesselImage) -> Scalars:
     path = bilinear(view.path_mm, at.reshape(-1, 2)).reshape(at.shape[:2])
     area, variance, alone = _moments(path, x)
     good &= alone & (variance > _LEAST_VARIANCE * _BLUR_PX2)
-    round_area = 4 * np.pi * (variance - _BLUR_PX2) * size_mm
-    return np.asarray(area[good] * sine[good] / round_area[good])
+    told = area * sine * size_mm / (4 * np.pi)
+    shown = (variance - _BLUR_PX2) * size_mm**2
+    return np.stack([told[good], shown[good]])
 
 
 def _moments(path: Array, x: Scalars) -> tuple[Scalars, Scalars, Array]:
