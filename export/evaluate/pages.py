@@ -7,7 +7,7 @@
     <!-- end -->
 
 from ``RESULTS/NAME/cases.csv``, which ``gcar-export evaluate --out RESULTS/NAME`` left. The block
-``overview`` has a line per folder of ``OVERVIEW`` that is there.
+``overview`` has a line per protocol of ``OVERVIEW`` whose folder is there.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from typing import Any
 
 import click
 
-from gcar_export.evaluate import tables
+from gcar_export.evaluate import peers, tables
 
-#: folder -> what was given
+#: protocol -> what was given; it lies in the folder that its name begins with
 OVERVIEW: Mapping[str, str] = {
     "paper": "path lengths 128 x 128, two views at 90 deg, whole trees",
     "clinical": "path lengths 512 x 512, clinical angles, left trees",
     "raw": "raw 8-bit pictures of the same",
-    "common": "binary masks 256 x 256, left and right arteries",
+    "common-lca": "binary masks 256 x 256, left arteries",
+    "common-rca": "binary masks 256 x 256, right arteries",
 }
 _SHOWN = ("dsc", "cldice", "chamfer_mm", "cpu_seconds")
 _BLOCK = re.compile(r"(<!-- figures: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
@@ -39,10 +40,13 @@ def overview(results: Path, method: str = "ours") -> str:
     head = ["given", "trees", *(c.heading for c in columns.values()), "ok / degraded / refused"]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, given in OVERVIEW.items():
-        if not (results / name / "cases.csv").is_file():
+        file = results / name.split("-")[0] / "cases.csv"
+        if not file.is_file():
             continue
-        rows = [r for r in tables.read_case_rows(results / name / "cases.csv")
-                if r["method"] == method]  # fmt: skip
+        rows = [
+            row for row in tables.read_case_rows(file)
+            if (row["protocol"], row["method"]) == (name, method)
+        ]  # fmt: skip
         (entry,) = tables.summarise(rows)
         cells = [tables.mean_sd(entry[key], column, len(rows)) for key, column in columns.items()]
         lines.append("| " + " | ".join([given, str(len(rows)), *cells, _statuses(rows)]) + " |")
@@ -62,7 +66,10 @@ def filled(text: str, results: Path) -> tuple[str, list[str]]:
             missing.append(name)
             return block[0]
         rows = tables.read_case_rows(file)
-        return f"{block[1]}{tables.markdown(rows, rows[0]['method'])}{block[4]}"
+        methods = {row["method"] for row in rows}
+        found = tables.markdown(rows, rows[0]["method"] if len(methods) > 1 else None)
+        beside = peers.beside_peers(rows)
+        return f"{block[1]}{found}{beside and chr(10) + beside}{block[4]}"
 
     return _BLOCK.sub(fill, text), missing
 
