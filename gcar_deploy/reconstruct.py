@@ -82,7 +82,7 @@ def reconstruct(
     keep = on_step or _nothing
     keep(frame)
     found = _reconstructed(seen, frame.grid(grid), asked, (predictor, segmenter), watch, keep)
-    return found.as_told(frame, angiograms, grid, options)
+    return found.as_given(frame, angiograms, grid, options)
 
 
 def _reconstructed(

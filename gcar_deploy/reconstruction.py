@@ -113,7 +113,7 @@ class Reconstruction:
         """Name of each branch (LM, LAD, LCx, RCA) with its probability; None: a number only."""
         return self.measured.names
 
-    def as_told(
+    def as_given(
         self, frame: OwnFrame, angiograms: Sequence[Angiogram], grid: Grid, options: RunOptions
     ) -> Self:
         """Return what was found in the scene's own frame as the scene was given.

@@ -81,9 +81,9 @@ def test_every_number_has_its_range_and_every_default_lies_in_it():
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        ("predict.looks", 5, "predict.looks = 5 must be a whole number, 1 .. 4"),
-        ("predict.looks", 2.5, "predict.looks = 2.5 must be a whole number, 1 .. 4"),
-        ("predict.looks", True, "predict.looks = True must be a whole number, 1 .. 4"),
+        ("predict.lattices", 5, "predict.lattices = 5 must be a whole number, 1 .. 4"),
+        ("predict.lattices", 2.5, "predict.lattices = 2.5 must be a whole number, 1 .. 4"),
+        ("predict.lattices", True, "predict.lattices = True must be a whole number, 1 .. 4"),
         ("quality.good_coverage", math.nan, "good_coverage = nan must be a number, 0 .. 1"),
         ("refine.tube.steps", (), "refine.tube.steps = () must be a tuple of 1 or more values"),
         ("refine.tube.steps", (3,), "refine.tube.steps must be as many as levels_mm"),
@@ -113,7 +113,7 @@ def test_threads_and_deadline(value):
 
 def test_numbers_of_other_libraries_are_numbers():
     np = pytest.importorskip("numpy")
-    check_options(PredictOptions(looks=np.int64(3), max_cell_mm=np.float32(1.5)))
+    check_options(PredictOptions(lattices=np.int64(3), max_cell_mm=np.float32(1.5)))
 
 
 @pytest.mark.slow

@@ -155,7 +155,7 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
     else:
         tree = label.left_right()[0].centred()
         carms, new, grid = clinical_geometry(views)
-    truly = _as_it_was if protocol == "moved" else _as_told
+    truly = _as_it_was if protocol == "moved" else _as_given
     paths = [truly(tree, carm, index) for index, carm in enumerate(carms)]
     if protocol == "raw":
         rng = np.random.default_rng(zlib.crc32(label.name.encode()))
@@ -279,7 +279,7 @@ def _at_centroid(tree: LabelVolume) -> LabelVolume:
     return tree.moved(-tree.grid.index2world(filled.mean(axis=0)))
 
 
-def _as_told(tree: LabelVolume, carm: CArm, index: int) -> Array:
+def _as_given(tree: LabelVolume, carm: CArm, index: int) -> Array:
     return raycast(tree, carm)
 
 

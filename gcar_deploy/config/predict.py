@@ -43,7 +43,7 @@ class PredictOptions:
     #: hull is thinned
     predictor: PredictorName = "auto"
     #: lattices on which the multi-view predictor judges the scene, each shifted against the others
-    looks: Annotated[int, Range(1, 4)] = 2
+    lattices: Annotated[int, Range(1, 4)] = 2
     #: edge of the lattice the predictor works on: the grid's own within these bounds, mm; thin
     #: vessels get finer cells down to ``thin_cell_mm`` where the predictor knows such cells
     min_cell_mm: Annotated[float, Range(0.3, 10)] = 0.85

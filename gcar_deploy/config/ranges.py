@@ -1,6 +1,6 @@
 """What each option may be: ranges stand beside the defaults, and are checked in one place.
 
-A field's range is part of its type, ``looks: Annotated[int, Range(1, 4)] = 2``. Outside it a run
+A field's range is part of its type, ``lattices: Annotated[int, Range(1, 4)] = 2``. Outside it a run
 would fail somewhere within, or take memory without end; inside it any value gives a result, if
 not a good one.
 """

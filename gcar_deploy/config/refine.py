@@ -34,7 +34,7 @@ class TubeOptions:
     #: radius: random walk of its log, 1 / sqrt(mm)
     taper: Annotated[float, Range(1e-6, 1e9)] = 0.1
     #: steps that refit the radii with the axes held, on fine pixels
-    calibre_steps: Annotated[int, Range(0, 10000)] = 3
+    radius_refit_steps: Annotated[int, Range(0, 10000)] = 3
     #: starting points: standard deviation over 1 mm of centreline, mm
     anchor_mm: Annotated[float, Range(1e-3, 1e6)] = 1.0
     #: starting radii: standard deviation of the log over 1 mm of centreline

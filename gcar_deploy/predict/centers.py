@@ -124,19 +124,19 @@ def find_centers(
     if isinstance(predictor, SingleViewPredictor):
         alone = predictor.predict([(view.carm, view.path_mm) for view in seen.views], stop)
         return Centers(merge_views(alone, seen.hull, seen.encoded))
-    told = predictor.predict(seen.hull, seen.encoded, stop)
+    predicted = predictor.predict(seen.hull, seen.encoded, stop)
     others = []
-    for look in range(1, options.predict.looks):
-        lattice = shifted_lattice(seen.hull.lattice, look)
-        near = near_evidence(seen.hull, told.confidence, look)
+    for number in range(1, options.predict.lattices):
+        lattice = shifted_lattice(seen.hull.lattice, number)
+        near = near_evidence(seen.hull, predicted.confidence, number)
         paths = [(carm, path) for carm, path, _ in seen.sampled]
         other = visual_hull(paths, lattice, seen.candidates, near)
         if len(other):
             others.append((other, predictor.predict(other, encode(other, seen.sampled), stop)))
-    told = mean_evidence(told, others)
+    predicted = mean_evidence(predicted, others)
     error = max(view.path_error for view in seen.views)
-    decided = decide(told, seen.encoded, error)
-    return Centers(decided, Evidence(told, seen.encoded.ray, seen.encoded.weight))
+    decided = decide(predicted, seen.encoded, error)
+    return Centers(decided, Evidence(predicted, seen.encoded.ray, seen.encoded.weight))
 
 
 def quick_tree(
@@ -151,5 +151,5 @@ def quick_tree(
     watch.check()
     if len(seen.hull) == 0:
         return empty_tree()
-    once = dataclasses.replace(options, predict=dataclasses.replace(options.predict, looks=1))
+    once = dataclasses.replace(options, predict=dataclasses.replace(options.predict, lattices=1))
     return build_tree(find_centers(seen, predictor, once, watch).points)

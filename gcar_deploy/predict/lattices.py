@@ -1,4 +1,4 @@
-"""Several looks at one scene: the predictor asked on lattices shifted against each other.
+"""Several lattices over one scene: the predictor asked on lattices shifted against each other.
 
 Where a thin vessel falls between the points of one lattice decides more of the evidence than it
 should. A second lattice, half a cell off along each axis (together they are body-centred cubic),
@@ -21,35 +21,35 @@ from gcar_deploy.types import Array, Scalars
 #: cells by which each lattice is shifted; the second fills the gaps of the first, and so on
 SHIFTS = ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.25, 0.5, 0.75), (0.75, 0.0, 0.25))
 
-#: after the first look only what lies near points of at least this confidence is asked again
-LOOK_AGAIN = 0.15
+#: after the first lattice only what lies near points of at least this confidence is asked again
+ASKED_AGAIN = 0.15
 
 
-def shifted_lattice(lattice: Grid, look: int) -> Grid:
-    """Return ``lattice`` moved by its look's share of a cell; look 0 is the lattice itself."""
-    if look == 0:
+def shifted_lattice(lattice: Grid, number: int) -> Grid:
+    """Return ``lattice`` moved by its share of a cell; number 0 is the lattice itself."""
+    if number == 0:
         return lattice
-    x, y, z = np.asarray(lattice.center_mm) + np.asarray(SHIFTS[look]) * lattice.spacing_mm
+    x, y, z = np.asarray(lattice.center_mm) + np.asarray(SHIFTS[number]) * lattice.spacing_mm
     return dataclasses.replace(lattice, center_mm=(float(x), float(y), float(z)))
 
 
-def near_evidence(first: Candidates, confidence: Scalars, look: int) -> Array:
-    """Find the points of a later look within 1.5 cells (per axis) of what the first believed.
+def near_evidence(first: Candidates, confidence: Scalars, number: int) -> Array:
+    """Find the points of a later lattice within 1.5 cells (per axis) of what the first believed.
 
     Parameters
     ----------
-    first : Candidates (n) of look 0
+    first : Candidates (n) of lattice 0
     confidence : (n,) what the predictor said of them
-    look : int
+    number : of the later lattice
 
     Returns
     -------
     (m, 3) int64, unique, within the lattice
     """
     shape = np.asarray(first.lattice.shape)
-    steps = [np.arange(np.ceil(-s - 1.5), np.floor(-s + 1.5) + 1) for s in SHIFTS[look]]
+    steps = [np.arange(np.ceil(-s - 1.5), np.floor(-s + 1.5) + 1) for s in SHIFTS[number]]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3).astype(np.int64)
-    believed = first.index[confidence >= LOOK_AGAIN]
+    believed = first.index[confidence >= ASKED_AGAIN]
     index = (believed[:, None] + offsets).reshape(-1, 3)
     index = index[((index >= 0) & (index < shape)).all(axis=1)]
     marked = np.zeros(shape, bool)
@@ -65,12 +65,12 @@ def mean_evidence(
     Parameters
     ----------
     first : CenterPoints (n), as the predictor gave them
-    others : per further look its candidates and what the predictor said of them, in their order
+    others : per further number its candidates and what the predictor said of them, in their order
 
     Returns
     -------
     CenterPoints
-        ``first`` with the mean confidence; what is no candidate of a look counts 0 there.
+        ``first`` with the mean confidence; what is no candidate of a number counts 0 there.
     """
     confidence = first.confidence.copy()
     for candidates, told in others:

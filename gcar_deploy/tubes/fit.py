@@ -22,7 +22,7 @@ from gcar_deploy.tubes.gauss_newton import (
 )
 from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
 from gcar_deploy.tubes.prior import TAPER_PIXEL_MM, Prior, make_prior
-from gcar_deploy.tubes.radius_refit import fit_calibre
+from gcar_deploy.tubes.radius_refit import refit_radii
 from gcar_deploy.tubes.settle import settled
 from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, unexplained
 from gcar_deploy.tubes.targets import Target, make_targets
@@ -145,7 +145,7 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     if not now.tree.branches:
         return dataclasses.replace(start, tree=now.tree, contrast=contrast)
     if not (options.levels_mm[-1] or progress.stopped or progress.failed):
-        now = _recalibred(now, targets, options)
+        now = _with_refitted_radii(now, targets, options)
     targets = rescaled(targets, now.prints)
     own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
     return dataclasses.replace(
@@ -161,11 +161,11 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     )
 
 
-def _recalibred(now: _State, targets: list[Target], options: TubeOptions) -> _State:
+def _with_refitted_radii(now: _State, targets: list[Target], options: TubeOptions) -> _State:
     """Refit the radii where the pixels are fine enough to show a narrow core."""
     if _pixel_mm(targets) >= TAPER_PIXEL_MM:
         return now
-    tubes, prints = fit_calibre(now.tubes, targets, now.prints, options)
+    tubes, prints = refit_radii(now.tubes, targets, now.prints, options)
     return _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
 
 

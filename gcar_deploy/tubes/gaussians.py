@@ -1,4 +1,4 @@
-"""Gaussians strung along the tubes of a tree: as few as its length needs, mass kept."""
+"""Gaussians along the tubes of a tree: as few as its length needs, mass kept."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONG_BOUNDS_MM = (0.6, 2.0)
 OVERLAP_PASSES = 3
 
 
-def strung_gaussians(tree: Tree) -> Gaussians:
+def gaussians_on_tree(tree: Tree) -> Gaussians:
     """Place Gaussians along every branch.
 
     Across the vessel sigma = r / sqrt(2): with density 1 on the axis the mass per length is that

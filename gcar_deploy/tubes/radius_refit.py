@@ -32,7 +32,7 @@ WALK, FREEDOM = 0.2, 3.0
 _REWEIGHTINGS = 3
 
 
-def fit_calibre(
+def refit_radii(
     tubes: Tubes, targets: list[Target], prints: list[Footprint], options: TubeOptions
 ) -> tuple[Tubes, list[Footprint]]:
     """Refit the radii of tubes whose axes stand.
@@ -42,7 +42,7 @@ def fit_calibre(
     tubes : Tubes after the last level
     targets : of the pictures' own pixels
     prints : where the tubes fall in them
-    options : TubeOptions; ``calibre_steps``
+    options : TubeOptions; ``radius_refit_steps``
 
     Returns
     -------
@@ -56,7 +56,7 @@ def fit_calibre(
         for target in targets
     ]
     low, high = np.log(RADIUS_BOUNDS_MM)
-    for _ in range(options.calibre_steps):
+    for _ in range(options.radius_refit_steps):
         step = _step(tubes, sharp, prints, options)
         if not np.isfinite(step).all():
             break

@@ -20,7 +20,7 @@ from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
-from gcar_deploy.tubes.gaussians import strung_gaussians
+from gcar_deploy.tubes.gaussians import gaussians_on_tree
 from gcar_deploy.tubes.volume import tube_volume
 from gcar_deploy.types import Array, Volume
 
@@ -116,7 +116,7 @@ def refine(
     status = "failed" if fit.progress.failed else status
     return Refined(
         refiner="tube",
-        gaussians=strung_gaussians(fit.tree),
+        gaussians=gaussians_on_tree(fit.tree),
         tree=fit.tree,
         losses=tuple(fit.progress.losses),
         steps=fit.progress.steps,
@@ -155,7 +155,7 @@ def _unrefined(centers: CenterPoints, views: int) -> Refined:
     tree = build_tree(centers)
     return Refined(
         refiner="none",
-        gaussians=strung_gaussians(tree),
+        gaussians=gaussians_on_tree(tree),
         tree=tree,
         losses=(),
         steps=0,

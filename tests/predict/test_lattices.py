@@ -93,9 +93,9 @@ def test_the_hull_among_given_points_is_the_hull_there():
     assert part.index.tolist() == sorted(part.index.tolist())
 
 
-@pytest.mark.parametrize("looks", [1, 2])
-def test_the_option_reaches_the_reconstruction(looks, monkeypatch):
-    """The demo, judged on one lattice or two: as many inferences as looks."""
+@pytest.mark.parametrize("lattices", [1, 2])
+def test_the_option_reaches_the_reconstruction(lattices, monkeypatch):
+    """The demo, judged on one lattice or two: one inference a lattice."""
     from gcar_deploy import Engine
     from gcar_deploy.data.demo_case import demo_case
     from gcar_deploy.predict.center_predictor import CenterPredictor
@@ -109,10 +109,10 @@ def test_the_option_reaches_the_reconstruction(looks, monkeypatch):
 
     monkeypatch.setattr(CenterPredictor, "predict", predict)
     options = RunOptions()
-    chosen = dataclasses.replace(options.predict, looks=looks)
-    assert PredictOptions().looks == 2
+    chosen = dataclasses.replace(options.predict, lattices=lattices)
+    assert PredictOptions().lattices == 2
     case = demo_case()
     engine = Engine(options=dataclasses.replace(options, predict=chosen))
     result = engine.reconstruct(list(case.pictures), case.geometry)
-    assert len(asked) == looks and result.status == "ok"
+    assert len(asked) == lattices and result.status == "ok"
     assert all(n < asked[0] for n in asked[1:])

@@ -58,7 +58,7 @@ def test_a_narrow_core_is_seen_in_fine_pixels(monkeypatch):
     views = seen(truth, two_views(512, 0.3))
     centers = points_of(truth, grid(64))
     least = {}
-    options = dataclasses.replace(OPTIONS, calibre_steps=0)
+    options = dataclasses.replace(OPTIONS, radius_refit_steps=0)
     eased = prior.MOST_TAPER_EASING
     for most in (1.0, eased):
         monkeypatch.setattr(prior, "MOST_TAPER_EASING", most)

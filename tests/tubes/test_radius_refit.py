@@ -11,7 +11,7 @@ from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import footprints
 from gcar_deploy.tubes.model import tubes_of
-from gcar_deploy.tubes.radius_refit import fit_calibre
+from gcar_deploy.tubes.radius_refit import refit_radii
 from gcar_deploy.tubes.targets import make_targets
 from tests.tree.shapes import branch, grid, points_of
 from tests.tubes.scenes import seen, two_views
@@ -45,7 +45,7 @@ def views_of(tree, noise_mm=0.0, **how):
 def refitted(start, views, options=OPTIONS):
     """Radii of ``start``'s tubes after the refit."""
     tubes, targets = tubes_of(start), make_targets(views, 0.0, options)
-    return fit_calibre(tubes, targets, footprints(tubes, targets), options)[0].radius_mm
+    return refit_radii(tubes, targets, footprints(tubes, targets), options)[0].radius_mm
 
 
 def test_a_core_that_was_rounded_off_comes_back():
@@ -58,7 +58,7 @@ def test_a_core_that_was_rounded_off_comes_back():
 def test_prints_are_those_of_the_new_radii():
     tubes = tubes_of(tube(narrowed(0.2)))
     targets = make_targets(views_of(tube(narrowed(0.6))), 0.0, OPTIONS)
-    after, prints = fit_calibre(tubes, targets, footprints(tubes, targets), OPTIONS)
+    after, prints = refit_radii(tubes, targets, footprints(tubes, targets), OPTIONS)
     for print_, fresh in zip(prints, footprints(after, targets), strict=True):
         np.testing.assert_allclose(print_.totals(), fresh.totals(), atol=1e-9)
 
@@ -82,7 +82,7 @@ def test_only_fine_pixels_are_asked(size, spacing, refits):
     truth = tube(narrowed(0.6))
     views = seen(truth, two_views(size, spacing))
     start = points_of(truth, grid())
-    options = [dataclasses.replace(OPTIONS, calibre_steps=steps) for steps in (0, 3)]
+    options = [dataclasses.replace(OPTIONS, radius_refit_steps=steps) for steps in (0, 3)]
     found = [fit_tubes(start, views, each) for each in options]
     least = [fit.tree.radii()[3:-3].min() for fit in found]
     assert (least[1] < least[0] - 0.02) == refits
