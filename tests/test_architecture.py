@@ -6,6 +6,7 @@ import ast
 import graphlib
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -227,3 +228,14 @@ def test_the_whole_runtime_never_imports_torch():
     ]
     code = "import importlib\n" + "\n".join(f"importlib.import_module({m!r})" for m in modules)
     assert "torch" not in loaded_by(code)
+
+
+def test_every_room_is_installed():
+    """A room that pyproject.toml does not name works in the checkout alone."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    named = settings["tool"]["setuptools"]["packages"]
+    there = ["gcar_models"]
+    for folder, package in (("gcar_deploy", "gcar_deploy"), ("export", "gcar_export")):
+        for file in (ROOT / folder).rglob("*.py"):
+            there.append(".".join((package, *file.parent.relative_to(ROOT / folder).parts)))
+    assert sorted(named) == sorted(set(there))
