@@ -45,6 +45,8 @@ FOUR = ("IM1", "IM4", "IM7", "IM8")
 NEAR_PX = 3.0
 #: a run may shift by so much, mm; distances beyond the cap do not pull
 REACH_MM, CAP_PX = 30.0, 12.0
+#: first steps of the simplex in the picture's plane and along the beam, mm
+_FIRST_MM = (1.0, 1.0, 15.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -200,17 +202,17 @@ def predict(name: str, view: VesselImage, tree: Tree) -> Prediction:
 
 
 def estimate_shift(carm: CArm, skeleton: Mask, tree: Tree) -> Array:
-    """(3,) mm, within the plane of the picture, that lays the tree on the skeleton.
+    """(3,) mm that lays the tree on the skeleton: a table moves up and down as well.
 
-    Capped distances both ways: from a lattice of 2 mm over ``REACH_MM``, then by simplex.
+    Capped distances both ways: from a lattice of 2 mm over ``REACH_MM`` in the picture's plane,
+    then by simplex, along the beam as well, which changes the magnification.
     """
     points = tree.points()
     far = np.minimum(distance_px(skeleton), CAP_PX)
     seen = np.argwhere(skeleton)[:, ::-1].astype(np.float64)
-    u, v, _ = carm.axes
 
     def cost(shift: Array, both: bool) -> float:
-        pixels = carm.moved(shift[0] * u + shift[1] * v).project(points)[0]
+        pixels = carm.moved(shift @ carm.axes).project(points)[0]
         at = np.rint(pixels).astype(int)
         inside = ((at >= 0) & (at < (carm.columns, carm.rows))).all(axis=1)
         own = np.where(inside, far[at[:, 1] * inside, at[:, 0] * inside], CAP_PX).mean()
@@ -220,16 +222,17 @@ def estimate_shift(carm: CArm, skeleton: Mask, tree: Tree) -> Array:
         return float(own + gap)
 
     steps = np.arange(-REACH_MM, REACH_MM + 1e-9, 2.0)
-    lattice = np.array([(a, b) for a in steps for b in steps])
+    lattice = np.array([(a, b, 0.0) for a in steps for b in steps])
     rough = np.array([cost(s, False) for s in lattice])
     starts = lattice[np.argsort(rough)[:4]]
     found = [
         minimize(cost, s, args=(True,), method="Nelder-Mead",
-                 options={"xatol": 0.02, "fatol": 1e-3, "maxfev": 120})
+                 options={"xatol": 0.02, "fatol": 1e-3, "maxfev": 240,
+                          "initial_simplex": s + np.vstack([np.zeros(3), np.diag(_FIRST_MM)])})
         for s in starts
     ]  # fmt: skip
     best = min(found, key=lambda f: f.fun).x
-    shift: Array = best[0] * u + best[1] * v
+    shift: Array = best @ carm.axes
     return shift
 
 

@@ -80,7 +80,7 @@ def test_real_tree_through_the_command():
              if "(n=1)" in line}  # fmt: skip
     assert list(lines) == ["multi", "single", "single, each view"]
     precision, recall = (float(lines["multi"].split("|")[k].split("±")[0]) for k in (2, 3))
-    assert precision > 90 and recall > 90
+    assert precision > 88 and recall > 88
     alone, merged = (float(lines[k].split("|")[2].split("±")[0])
                      for k in ("single, each view", "single"))  # fmt: skip
     assert alone < merged < precision
