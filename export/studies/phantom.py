@@ -47,6 +47,8 @@ NEAR_PX = 3.0
 REACH_MM, CAP_PX = 30.0, 12.0
 #: first steps of the simplex in the picture's plane and along the beam, mm
 _FIRST_MM = (1.0, 1.0, 15.0)
+#: what a millimetre along the beam costs, pixels of mean distance: rounding must not move a run
+_BEAM_COST_PX = 0.005
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -216,6 +218,7 @@ def estimate_shift(carm: CArm, skeleton: Mask, tree: Tree) -> Array:
         at = np.rint(pixels).astype(int)
         inside = ((at >= 0) & (at < (carm.columns, carm.rows))).all(axis=1)
         own = np.where(inside, far[at[:, 1] * inside, at[:, 0] * inside], CAP_PX).mean()
+        own += _BEAM_COST_PX * abs(shift[2])
         if not both:
             return float(own)
         gap = np.minimum(cKDTree(pixels).query(seen)[0], CAP_PX).mean()

@@ -36,7 +36,16 @@ def test_a_shift_in_the_picture_plane_is_found():
     told = view.carm.moved(-7.0 * u + 4.0 * v)
     shift = estimate_shift(told, view.skeleton, tree)
     assert shift @ u == pytest.approx(7.0, abs=0.7) and shift @ v == pytest.approx(-4.0, abs=0.7)
-    assert shift @ d == pytest.approx(0.0, abs=1e-9)
+    assert shift @ d == pytest.approx(0.0, abs=1.0)
+
+
+def test_a_shift_along_the_beam_is_found():
+    """By the magnification: 40 mm nearer to the source make a tree of some 30 mm 1 mm larger."""
+    angiograms, _, tree = tiny_case()
+    view = extract_vessels(angiograms[0], ImagingOptions())
+    d = view.carm.axes[2]
+    shift = estimate_shift(view.carm.moved(-40.0 * d), view.skeleton, tree)
+    assert shift @ d == pytest.approx(40.0, abs=15.0)
 
 
 def test_a_run_is_predicted_by_its_own_tree():
