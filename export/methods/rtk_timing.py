@@ -20,7 +20,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Volume
 from gcar_export.methods import rtk_geometry
-from gcar_export.scenes.protocols import PAPER_VOXEL_MM, Case
+from gcar_export.scenes.protocols import Case, case_geometry
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,19 +83,7 @@ def time_pair(case: Case, options: RunOptions | None = None, repeats: int = 7) -
 
 def pair_carms() -> list[CArm]:
     """Return the two views of the unit: the paper's set-up, 128x128 pixels."""
-    h = PAPER_VOXEL_MM
-    return [
-        CArm(
-            primary_angle_deg=primary,
-            secondary_angle_deg=0,
-            sod_mm=1000 * h,
-            sdd_mm=1500 * h,
-            rows=128,
-            columns=128,
-            pixel_spacing_mm=(1.5 * h, 1.5 * h),
-        )
-        for primary in (0.0, 90.0)
-    ]
+    return case_geometry("paper", 2)[0]
 
 
 def projection_pair(
