@@ -16,9 +16,8 @@ from gcar_deploy.types import Image
 #: pictures are compared at this size, smaller ones at their own: noise, depth and scale of the
 #: grey values no longer matter
 _SIDE = 96
-#: Correlation from which two pictures are one. A copy in 8 bits, with 2 % of noise or at half
-#: the size has 0.98 and more; different views of one tree have at most 0.2, and those of a phantom
-#: on the same table, collimator and all, 0.70
+#: Correlation from which two pictures are one, between copies in other depths, sizes and noise
+#: and different views that share table and collimator
 _SAME = 0.94
 #: what varies over more than this is background, pixels of that size
 _BACKGROUND_PX = 3.0

@@ -31,11 +31,10 @@ _LEAST_VARIANCE = 2.0
 _LEAST_SINE = 0.5
 #: fewer profiles than this tell nothing
 _LEAST_PROFILES = 25
-#: Factors up to which nothing is said. Round generated trees give 0.99 to 1.05 at pixels of 0.1 to
-#: 0.4 mm, three real ones 0.90 to 0.96 (their lumens are wider than deep in those views). Where
-#: pixels are as wide as vessels, neighbours merge: 0.64 to 1.25, real ones 0.97 to 1.08
+#: Factors up to which nothing is said: real lumens may be wider than deep in a view. Where pixels
+#: are as wide as vessels, neighbours merge, and more is let pass
 _TOLERANCE, _TOLERANCE_COARSE, _COARSE_MM = 1.2, 1.6, 0.8
-#: and below 1, where soft edges can look like it: one tree of soft voxels has 0.70 in both views
+#: and below 1, where soft edges can look like it; set after a tree of soft voxels had been doubted
 _SHORT = 0.6
 #: from here on paths are too long for any vessel in a picture that is not coarse
 _REFUSED = 1.5
