@@ -140,6 +140,9 @@ def pair_time(label: Path, repeats: int) -> None:
 @click.option(
     "--learning-rate", type=click.FloatRange(0, 1, min_open=True), help="The preset's otherwise."
 )
+@click.option(
+    "--seed", type=click.IntRange(1), help="Of the scenes; a tuning wants another than its model's."
+)
 @click.option("--warm-start", type=_FILE, help="Go on from the weights of this model (.onnx).")
 def train(
     out: Path,
@@ -150,6 +153,7 @@ def train(
     minutes: float | None,
     labels: Path | None,
     learning_rate: float | None,
+    seed: int | None,
     warm_start: Path | None,
 ) -> None:
     """Train a predictor on generated trees; stop and go on at will.
@@ -160,7 +164,7 @@ def train(
 
     start(
         out, network, preset, steps=steps, decay_steps=decay_steps, minutes=minutes, labels=labels,
-        learning_rate=learning_rate, warm_start=warm_start,
+        learning_rate=learning_rate, seed=seed, warm_start=warm_start,
     )  # fmt: skip
 
 

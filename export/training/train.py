@@ -20,6 +20,7 @@ def start(
     steps: int | None = None,
     decay_steps: int | None = None,
     learning_rate: float | None = None,
+    seed: int | None = None,
     minutes: float | None = None,
     labels: Path | None = None,
     warm_start: Path | None = None,
@@ -31,7 +32,7 @@ def start(
     out : folder of the run; a run that is there goes on
     network : ``multi`` or ``single``
     preset : ``cpu``, ``gpu``, ``tune`` (multi alone) or ``tiny``
-    steps, decay_steps, learning_rate : replace the preset's
+    steps, decay_steps, learning_rate, seed : replace the preset's
     minutes : stop after so long
     labels : folder of label volumes (NIfTI, NRRD, MetaImage) that half of the scenes show
     warm_start : model (.onnx) whose weights are the first, multi alone
@@ -55,7 +56,7 @@ def start(
         from gcar_export.scenes.label_trees import read_label_trees
 
         trees, hashes = read_label_trees(labels)
-    asked = {"steps": steps, "decay_steps": decay_steps, "learning_rate": learning_rate}
+    asked = {"steps": steps, "decay_steps": decay_steps, "learning_rate": learning_rate, "seed": seed}
     changes: dict[str, Any] = {k: v for k, v in asked.items() if v}
     until = minutes * 60 if minutes else None
     if network == "multi":
