@@ -56,7 +56,9 @@ def start(
         from gcar_export.scenes.label_trees import read_label_trees
 
         trees, hashes = read_label_trees(labels)
-    asked = {"steps": steps, "decay_steps": decay_steps, "learning_rate": learning_rate, "seed": seed}
+    asked = {
+        "steps": steps, "decay_steps": decay_steps, "learning_rate": learning_rate, "seed": seed,
+    }  # fmt: skip
     changes: dict[str, Any] = {k: v for k, v in asked.items() if v}
     until = minutes * 60 if minutes else None
     if network == "multi":
