@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Array, Points, Volume
 from gcar_export.scenes.labels import LabelVolume
 from gcar_export.scenes.raw_pictures import raw_picture
-from gcar_export.scenes.raycast import raycast
+from gcar_export.scenes.raycast import raycast, silhouette
 
 #: set-ups with masks of one artery -> side of the label, pitch in mm, (primary, secondary)
 COMMON: Mapping[str, tuple[int, float, tuple[tuple[float, float], ...]]] = {
@@ -45,8 +45,6 @@ COMMON: Mapping[str, tuple[int, float, tuple[tuple[float, float], ...]]] = {
     "common-rca": (1, 0.55, ((-20, 20), (60, 0))),
 }
 PROTOCOLS = ("paper", "clinical", "moved", "raw", *COMMON)
-#: a ray through half a voxel of the labels (0.5 mm) or more is vessel in a mask, mm
-MASK_PATH_MM = 0.25
 #: mm of vessel per count of a simulated 16-bit picture.
 MM_PER_COUNT = 0.001
 PAPER_VOXEL_MM = 180.0 / 128
@@ -155,18 +153,7 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
     else:
         tree = label.left_right()[0].centred()
         carms, new, grid = clinical_geometry(views)
-    truly = _as_it_was if protocol == "moved" else _as_given
-    paths = [truly(tree, carm, index) for index, carm in enumerate(carms)]
-    if protocol == "raw":
-        rng = np.random.default_rng(zlib.crc32(label.name.encode()))
-        pictures = tuple(raw_picture(path, rng) for path in paths)
-        intensity = Intensity(kind="raw", polarity="dark", mm_per_count=None)
-    elif protocol in COMMON:
-        pictures = tuple(np.uint8(255) * (path >= MASK_PATH_MM) for path in paths)
-        intensity = Intensity(kind="mask", polarity="bright", mm_per_count=None)
-    else:
-        pictures = tuple(_counts(path) for path in paths)
-        intensity = Intensity(kind="path_length", polarity="bright", mm_per_count=MM_PER_COUNT)
+    pictures, intensity = _pictures(tree, protocol, carms)
     scene = Scene(
         views=tuple(
             View(id=str(index + 1), carm=carm, intensity=intensity)
@@ -277,6 +264,23 @@ def _at_centroid(tree: LabelVolume) -> LabelVolume:
     """Return the tree moved so that its centroid is the isocentre."""
     filled = np.argwhere(tree.occupancy >= 0.5)
     return tree.moved(-tree.grid.index2world(filled.mean(axis=0)))
+
+
+def _pictures(
+    tree: LabelVolume, protocol: str, carms: Sequence[CArm]
+) -> tuple[tuple[Array, ...], Intensity]:
+    """Draw what the views show; say what a pixel means."""
+    if protocol in COMMON:
+        masks = tuple(np.uint8(255) * silhouette(tree, carm) for carm in carms)
+        return masks, Intensity(kind="mask", polarity="bright", mm_per_count=None)
+    truly = _as_it_was if protocol == "moved" else _as_given
+    paths = [truly(tree, carm, index) for index, carm in enumerate(carms)]
+    if protocol == "raw":
+        rng = np.random.default_rng(zlib.crc32(tree.name.encode()))
+        raw = tuple(raw_picture(path, rng) for path in paths)
+        return raw, Intensity(kind="raw", polarity="dark", mm_per_count=None)
+    counts = tuple(_counts(path) for path in paths)
+    return counts, Intensity(kind="path_length", polarity="bright", mm_per_count=MM_PER_COUNT)
 
 
 def _as_given(tree: LabelVolume, carm: CArm, index: int) -> Array:

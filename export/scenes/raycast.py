@@ -11,11 +11,13 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.types import Array, Image
+from gcar_deploy.types import Array, Image, Mask
 from gcar_export.scenes.labels import LabelVolume
 
-#: distance between samples along a ray, mm.
-STEP_MM = 0.4
+#: distance between samples along a ray, mm; and where only its outline is asked for
+STEP_MM, OUTLINE_STEP_MM = 0.4, 0.1
+#: occupancy of a vessel's surface
+SURFACE = 0.5
 #: edge of the blocks that are skipped when empty, voxels.
 BLOCK = 8
 
@@ -44,6 +46,32 @@ def raycast(
     -------
     (rows, columns) float32, mm
     """
+    return _cast(label, carm, step_mm, margin_mm)
+
+
+def silhouette(label: LabelVolume, carm: CArm) -> Mask:
+    """Pixels whose central ray meets the surface of occupancy 0.5.
+
+    Occupancy is trilinear between the voxels, so that a soft or coarse label's shadow is as wide
+    as the vessel that it stands for.
+
+    Parameters
+    ----------
+    label : LabelVolume
+    carm : CArm
+
+    Returns
+    -------
+    (rows, columns) bool
+    """
+    inside: Mask = _cast(label, carm, OUTLINE_STEP_MM, level=SURFACE) > 0
+    return inside
+
+
+def _cast(
+    label: LabelVolume, carm: CArm, step_mm: float, margin_mm: float = 0.0, level: float = 0.0
+) -> Image:
+    """Sum of the samples times the step; with a ``level``, of those inside it, 1 for each."""
     occupancy = np.ascontiguousarray(label.occupancy, dtype=np.float32)
     if not occupancy.any():
         return np.zeros((carm.rows, carm.columns), np.float32)
@@ -62,7 +90,7 @@ def raycast(
         inverse * scale[:, None],
         label.grid.spacing_mm,
         np.array([row0, row1, col0, col1]),
-        np.array([_first_sample(label, carm) - margin_mm, step_mm]),
+        np.array([_first_sample(label, carm) - margin_mm, step_mm, level]),
     )
     return out
 
@@ -120,7 +148,7 @@ def _march(occupancy, blocks, source, pixel2index, spacing, window, start_step):
     nx, ny, nz = occupancy.shape
     limits = np.array([nx, ny, nz])
     row0, row1, col0, col1 = window
-    start, step = start_step
+    start, step, level = start_step
     out = np.zeros((row1 - row0, col1 - col0), np.float32)
     ray = np.empty(3)
     for row in range(row0, row1):
@@ -160,6 +188,7 @@ def _march(occupancy, blocks, source, pixel2index, spacing, window, start_step):
                     if not blocks[i0 // BLOCK, i1 // BLOCK, i2 // BLOCK]:
                         continue
                 fx, fy, fz = x - i0, y - i1, z - i2
+                value = 0.0
                 for dx in range(2):
                     px = i0 + dx
                     if px < 0 or px >= nx:
@@ -174,6 +203,10 @@ def _march(occupancy, blocks, source, pixel2index, spacing, window, start_step):
                             pz = i2 + dz
                             if pz < 0 or pz >= nz:
                                 continue
-                            total += wy * (fz if dz else 1.0 - fz) * occupancy[px, py, pz]
+                            value += wy * (fz if dz else 1.0 - fz) * occupancy[px, py, pz]
+                if level <= 0.0:
+                    total += value
+                elif value >= level:
+                    total += 1.0
             out[row - row0, col - col0] = total * step
     return out

@@ -8,7 +8,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.raw_pictures import raw_picture
-from gcar_export.scenes.raycast import as_label, raycast
+from gcar_export.scenes.raycast import as_label, raycast, silhouette
 from tests.conftest import data_dir
 
 MOVED_MM, TURNED_DEG = (1.5, -2.0, 3.0), 1.0
@@ -59,6 +59,19 @@ def test_chords_of_a_ball(angles):
     assert np.abs(picture - exact)[inside].max() < 0.15
     assert picture[off2.reshape(picture.shape) > (radius + 0.5) ** 2].max() == 0
     assert picture.sum() == pytest.approx(exact.sum(), rel=2e-3)
+
+
+@pytest.mark.parametrize("spacing", [0.5, 1.5])
+def test_silhouette_is_as_wide_as_the_vessel_however_coarse_the_label(spacing):
+    center, radius = np.array([3.0, -2.0, 4.0]), 9.0
+    view = carm(30, 25, size=192)
+    row, column = np.mgrid[0 : view.rows, 0 : view.columns]
+    rays = view.rays(np.column_stack([column.ravel(), row.ravel()]))
+    along = (center - view.source_mm) @ rays.T
+    off = np.sqrt(((center - view.source_mm) ** 2).sum() - along**2).reshape(row.shape)
+    inside = silhouette(ball(center, radius, spacing), view)
+    assert inside[off < radius - 0.1].all()
+    assert not inside[off > radius + 0.1].any()
 
 
 def test_points_land_where_the_camera_says():
