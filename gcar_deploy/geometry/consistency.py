@@ -30,28 +30,32 @@ class Mass:
     pixels : (n, 2) (col, row)
     path : (n,) path length, mm where ``calibrated``, else in any scale
     calibrated : bool
+    mask : bool, the path is told by a mask's width alone: of two vessels that overlap one counts
     """
 
     carm: CArm
     pixels: Pixels
     path: Scalars
     calibrated: bool = False
+    mask: bool = False
 
 
-def vessel_mass(carm: CArm, path_mm: Image, calibrated: bool = False) -> Mass | None:
+def vessel_mass(
+    carm: CArm, path_mm: Image, calibrated: bool = False, mask: bool = False
+) -> Mass | None:
     """Collect the pixels with vessel; None where there is none.
 
     Parameters
     ----------
     carm : CArm of the picture's size
     path_mm : (rows, cols) path length, zero outside vessels; any scale unless ``calibrated``
-    calibrated : bool
+    calibrated, mask : see ``Mass``
     """
     rows, cols = np.nonzero(path_mm > 0)
     if len(rows) == 0:
         return None
     pixels = np.column_stack([cols, rows]).astype(np.float64)
-    return Mass(carm, pixels, path_mm[rows, cols].astype(np.float64), calibrated)
+    return Mass(carm, pixels, path_mm[rows, cols].astype(np.float64), calibrated, mask)
 
 
 def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tuple[Array, Array]:

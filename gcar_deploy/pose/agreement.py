@@ -101,7 +101,8 @@ def poses_between(
         marks[:, k] = (marks[:, k] - old) * scale + new
     if known is not None:
         return judged_poses(known, small, pose, marks, calibrated)
-    return estimate_poses(small, pose, marks, calibrated)
+    masks = [view.kind == "mask" for view in views]
+    return estimate_poses(small, pose, marks, calibrated, masks)
 
 
 def other_order(views: Sequence[VesselImage], options: RunOptions) -> float | None:

@@ -22,6 +22,7 @@ from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, 
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.geometry.prior import LANDMARK_MM, OFFSET_MM
 from gcar_deploy.pose.profile_fit import (
+    MASK_NOISE,
     MIN_GAIN,
     MOST_APART_DEG,
     PROFILE_NOISE,
@@ -102,6 +103,10 @@ class _Problem:
         return out
 
     @property
+    def noise(self) -> float:
+        return MASK_NOISE if any(mass.mask for mass in self.seen.values()) else PROFILE_NOISE
+
+    @property
     def prior(self) -> Array:
         return prior_sigmas()
 
@@ -166,7 +171,7 @@ class _Problem:
             for step in steps:
                 at = zero.copy()
                 at[j, :3] = step * normal
-                apart = self.differences(i, j, at, self.options.coarse_mm) / PROFILE_NOISE
+                apart = self.differences(i, j, at, self.options.coarse_mm) / self.noise
                 misfit.append(float(np.sum(apart**2)))
             curves.append((i, j, normal, CubicSpline(steps, misfit, bc_type="clamped")))
 
@@ -196,7 +201,7 @@ class _Problem:
         calibrated = all(mass.calibrated for mass in self.seen.values())
         x = fit_profiles(
             self.residuals, self.left, theta[1:].ravel(), prior, self.options,
-            calibrated=calibrated,
+            calibrated=calibrated, noise=self.noise,
         )  # fmt: skip
         return _with_first(x)
 

@@ -28,6 +28,8 @@ from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.geometry.prior import LANDMARK_MM
 from gcar_deploy.pose.joint import corrected, estimate_jointly
 from gcar_deploy.pose.profile_fit import (
+    MASK_MIN_GAIN,
+    MASK_NOISE,
     MIN_GAIN,
     MOST_APART_DEG,
     PROFILE_NOISE,
@@ -93,6 +95,7 @@ def estimate_poses(
     options: PoseOptions,
     landmarks: Array | None = None,
     calibrated: Sequence[bool] | None = None,
+    masks: Sequence[bool] | None = None,
 ) -> tuple[Pose, ...]:
     """Estimate the correction of every view against the first, directly or through others.
 
@@ -110,6 +113,7 @@ def estimate_poses(
     landmarks : (m, V, 2) (col, row) of points marked in the views as they are here, nan where
         not seen; the rays of one point must meet
     calibrated : per view, whether the path lengths are in mm; none where left out
+    masks : per view, whether they are told by the width of a mask; none where left out
 
     Returns
     -------
@@ -117,7 +121,8 @@ def estimate_poses(
     """
     marks = np.empty((0, len(views), 2)) if landmarks is None else landmarks
     exact = [False] * len(views) if calibrated is None else calibrated
-    masses = [vessel_mass(*view, known) for view, known in zip(views, exact, strict=True)]
+    wide = [False] * len(views) if masks is None else masks
+    masses = [vessel_mass(*v, *known) for v, *known in zip(views, exact, wide, strict=True)]
     poses = {0: Pose()}
     while len(poses) < len(views):
         left = [k for k in range(len(views)) if k not in poses]
@@ -214,14 +219,16 @@ def _estimate(
 
     normal = plane_normal(fixed.carm, moving.carm)
     start, best = np.zeros(5), np.inf
-    near = calibrated and apart <= PROFILE_NOISE
+    mask = fixed.mask or moving.mask
+    noise, most_left = (MASK_NOISE, MASK_MIN_GAIN) if mask else (PROFILE_NOISE, MIN_GAIN)
+    near = calibrated and apart <= noise
     reach = 0.0 if near else SEARCH_MM
     for shift in np.arange(-reach, reach + 1e-9, STEP_MM):
         theta = np.concatenate([shift * normal, np.zeros(2)])
-        r = residuals(theta, options.coarse_mm, PROFILE_NOISE)
+        r = residuals(theta, options.coarse_mm, noise)
         if float(r @ r) < best:
             start, best = theta, float(r @ r)
-    start = fit_profiles(residuals, left, start, prior, options, calibrated=calibrated)
+    start = fit_profiles(residuals, left, start, prior, options, calibrated=calibrated, noise=noise)
     carm = corrected(moving.carm, start)
     after, gap_after = (
         disagreement(fixed, moving, carm, options.fine_mm),
@@ -229,7 +236,7 @@ def _estimate(
     )
     marked = gap is not None and gap_after is not None
     better = marked and (gap_after or 0.0) < MIN_GAIN * (gap or 0.0)
-    if after > MIN_GAIN * before and not better:
+    if after > most_left * before and not better:
         # Not clearly better than the geometry as given: leave it alone.
         return given
     x, y, z, primary, secondary = (float(value) for value in start)

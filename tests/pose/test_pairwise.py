@@ -6,6 +6,7 @@ import pytest
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.epipolar import plane_normal
+from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose, estimate_poses
 
@@ -52,6 +53,27 @@ def test_shift_with_an_angle_error_as_in_a_room():
     moved = np.array([1.5, -2.0, 3.0])
     pose = estimate_poses(pictures(moved=moved, turned=1.0), PoseOptions())[1]
     assert np.dot(pose.offset_mm, normal) == pytest.approx(moved @ normal, abs=0.6)
+
+
+def as_masks(views):
+    return [(c, mask_path(path > 0, c.pixel_at_isocenter_mm)) for c, path in views]
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13, 14])
+def test_masks_as_placed_are_left_alone(seed):
+    views = as_masks(pictures(seed=seed))
+    pose = estimate_poses(views, PoseOptions(), masks=(True, True))[1]
+    assert pose.before > 0.03, "overlaps make the profiles of masks differ"
+    assert pose.offset_mm == (0, 0, 0)
+
+
+def test_a_shift_that_masks_show_is_recovered_and_the_hidden_part_not_invented():
+    normal = plane_normal(*TOLD)
+    views = as_masks(pictures(moved=6 * normal, seed=11))
+    pose = estimate_poses(views, PoseOptions(), masks=(True, True))[1]
+    found = np.array(pose.offset_mm)
+    assert found @ normal == pytest.approx(6, abs=1)
+    assert np.linalg.norm(found - (found @ normal) * normal) < 2
 
 
 #: pictures of 0.24 mm, whose rays through the pixels' centres miss little of any vessel
