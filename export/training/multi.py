@@ -9,7 +9,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import multiprocessing.connection
+import os
 import socket
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -210,7 +213,24 @@ def train(
     torch.multiprocessing.spawn(_replica, args=(job,), nprocs=options.replicas, join=True)
 
 
+def _end_with_parent() -> None:
+    """End this process as soon as the one that started it is gone, however that ended.
+
+    A replica that trains on alone would write into the folder of the run that replaced it.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _replica(rank: int, job: _Job) -> None:
+    _end_with_parent()
     options, scenes = job.options, SceneOptions()
     torch.set_num_threads(1 if options.replicas > 1 else torch.get_num_threads())
     if options.replicas > 1:

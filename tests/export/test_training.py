@@ -2,6 +2,10 @@
 
 import dataclasses
 import functools
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,6 +128,42 @@ def test_training_resumes_to_the_bit(tmp_path):
     assert a.keys() == b.keys()
     for key in a:
         assert torch.equal(a[key], b[key]), key
+
+
+def _children(pid):
+    return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_replicas_end_with_their_parent(tmp_path):
+    code = (
+        "import dataclasses, pathlib, sys\nfrom gcar_export.training.multi import *\n"
+        "if __name__ == '__main__':\n"
+        "    o = dataclasses.replace(PRESETS['tiny'], steps=100000, replicas=2)\n"
+        "    train(pathlib.Path(sys.argv[1]), o, CONFIGS['tiny'])\n"
+    )
+    program = tmp_path / "train.py"
+    program.write_text(code)
+    with subprocess.Popen([sys.executable, str(program), str(tmp_path / "run")]) as parent:
+        until = time.monotonic() + 240
+        while not (tmp_path / "run/checkpoint.safetensors").exists():
+            assert time.monotonic() < until and parent.poll() is None
+            time.sleep(0.5)
+        replicas = _children(parent.pid)
+        parent.kill()
+    assert len(replicas) >= 2
+    until = time.monotonic() + 60
+    while any(Path(f"/proc/{pid}/cmdline").exists() and _alive(pid) for pid in replicas):
+        assert time.monotonic() < until
+        time.sleep(0.2)
+
+
+def _alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 @pytest.mark.slow
