@@ -30,6 +30,9 @@ class RuntimeRow:
     pose : False leaves the views where the scene puts them
     segmenter : who finds vessels in raw pictures; None for what the runtime does unasked
     fused : False leaves the tubes round: no correction of the volume by pictures and points
+    lattices : asked of the predictor; None for what the runtime does unasked
+    coarse : True leaves the cells as wide as the volume's voxels, however thin the vessels
+    grey_masks : True gives masks as raw grey pictures, whose brightness is believed
     """
 
     predictor: PredictorName | None = None
@@ -38,6 +41,9 @@ class RuntimeRow:
     swapped: bool = False
     pose: bool = True
     fused: bool = True
+    lattices: int | None = None
+    coarse: bool = False
+    grey_masks: bool = False
     segmenter: SegmenterName | None = None
 
 
@@ -48,6 +54,9 @@ RUNTIME_ROWS: Mapping[str, RuntimeRow] = {
     "ours-swapped": RuntimeRow(swapped=True),
     "ours-nopose": RuntimeRow(pose=False),
     "ours-round": RuntimeRow(fused=False),
+    "ours-onelattice": RuntimeRow(lattices=1),
+    "ours-coarse": RuntimeRow(coarse=True),
+    "ours-greymask": RuntimeRow(grey_masks=True),
     "ours-classic": RuntimeRow(segmenter="classic"),
     "ours-net": RuntimeRow(segmenter="net"),
     "hull": RuntimeRow(predictor="none", refiner="none"),
@@ -78,6 +87,9 @@ DESCRIPTIONS: Mapping[str, str] = {
     "ours-swapped": "the same, views given in the other order",
     "ours-nopose": "the same without the estimate of shifts between the views",
     "ours-round": "the same with round tubes alone in the volume",
+    "ours-onelattice": "the same, the predictor asked on one lattice",
+    "ours-coarse": "the same, cells no finer than the volume's voxels",
+    "ours-greymask": "the same, masks taken for grey pictures",
     "ours-classic": "the same, vessels of raw pictures found without the network",
     "ours-net": "the same, vessels of raw pictures found by the network alone",
     "hull": "hull thinned: no model, no refinement",
@@ -141,7 +153,10 @@ class MethodSettings:
             ),
             pose=dataclasses.replace(run.pose, enabled=run.pose.enabled and row.pose),
             predict=dataclasses.replace(
-                run.predict, predictor=row.predictor or run.predict.predictor
+                run.predict,
+                predictor=row.predictor or run.predict.predictor,
+                lattices=row.lattices or run.predict.lattices,
+                thin_cell_mm=(run.predict.min_cell_mm if row.coarse else run.predict.thin_cell_mm),
             ),
             refine=dataclasses.replace(
                 run.refine,
@@ -168,6 +183,7 @@ class MethodSettings:
             out = {
                 "run": {k: v for k, v in dataclasses.asdict(options).items() if k in _STAGES},
                 "swapped": RUNTIME_ROWS[method].swapped,
+                "grey_masks": RUNTIME_ROWS[method].grey_masks,
                 "models": _model_hashes(options.predict.predictor),
             }
         elif method == FBP_PAPER:

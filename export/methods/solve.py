@@ -18,8 +18,15 @@ from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import GcarError, ModelError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Image, Points, Volume
-from gcar_export.methods.settings import FBP_PAPER, METHODS, RUNTIME_ROWS, MethodSettings
+from gcar_export.methods.settings import (
+    FBP_PAPER,
+    METHODS,
+    RUNTIME_ROWS,
+    MethodSettings,
+    RuntimeRow,
+)
 from gcar_export.scenes.protocols import Case
 from gcar_export.scenes.thin_protocol import along
 
@@ -66,7 +73,7 @@ def solve(case: Case, method: str, settings: MethodSettings | None = None) -> So
     try:
         if method in RUNTIME_ROWS:
             options = settings.run_options(method)
-            return _runtime(case, options, swapped=RUNTIME_ROWS[method].swapped)
+            return _runtime(case, options, RUNTIME_ROWS[method])
         _warm_up(method)
         clock = _Clock()
         if method == FBP_PAPER:
@@ -143,11 +150,13 @@ def _session(options: RunOptions) -> _Session:
     return _Session(engine)
 
 
-def _runtime(case: Case, options: RunOptions, *, swapped: bool) -> Solved:
+def _runtime(case: Case, options: RunOptions, row: RuntimeRow) -> Solved:
     session = _session(options)
     angiograms, grid = case.angiograms(), case.grid
-    if swapped:
+    if row.swapped:
         angiograms = angiograms[::-1]
+    if row.grey_masks:
+        angiograms = [_as_grey(angiogram) for angiogram in angiograms]
     if not session.warm:
         # Times are those of a warm session: model loaded, modules imported.
         session.engine.warmup()
@@ -163,6 +172,15 @@ def _runtime(case: Case, options: RunOptions, *, swapped: bool) -> Solved:
         line_mm=None
         if case.line_mm is None
         else along([b.points_mm for b in result.tree.branches]),
+    )
+
+
+def _as_grey(angiogram: Angiogram) -> Angiogram:
+    """Return a mask as a raw picture of its brightness; other pictures as they are."""
+    if angiogram.intensity.kind != "mask":
+        return angiogram
+    return dataclasses.replace(
+        angiogram, intensity=dataclasses.replace(angiogram.intensity, kind="raw")
     )
 
 
