@@ -15,6 +15,7 @@ from gcar_deploy.config.ranges import Range, check_number
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.net import Segmenter, load_segmenter
+from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.order import Order, check_views
 from gcar_deploy.inputs.pictures import Geometry, Mask, Picture, prepare
 from gcar_deploy.output.bundle import check_extras
@@ -142,7 +143,7 @@ class Engine:
         """
         if deadline_s is not None:
             check_number("deadline_s", deadline_s, float, Range(1e-9, 1e9))
-        task = _Task(views, geometry, masks or {}, self.options, deadline_s)
+        task = _Task(views, geometry, masks or {}, {}, self.options, deadline_s)
         return self._solve(task, on_progress, cancel, on_step)
 
     def reconstruct_order(
@@ -170,7 +171,9 @@ class Engine:
         limits = [limit for limit in (order.deadline_s, limit_s) if limit is not None]
         options = order.options(self.options)
         deadline_s = min(limits, default=None)
-        task = _Task(order.views, order.geometry, order.masks, options, deadline_s)
+        task = _Task(
+            order.views, order.geometry, order.masks, order.drawn, options, deadline_s
+        )  # fmt: skip
         return self._solve(task, on_progress, cancel, on_step)
 
     def _solve(
@@ -184,7 +187,9 @@ class Engine:
         options = task.options
         check_options(options)
         predictor, missing = self._predictor_for(options.predict)
-        angiograms, grid, notes = prepare(task.views, task.geometry, options, task.masks)
+        angiograms, grid, notes = prepare(
+            task.views, task.geometry, options, task.masks, task.drawn
+        )
         wanted = options.imaging.segmenter if asks_network(angiograms) else "classic"
         found = reconstruct(
             angiograms,
@@ -208,6 +213,7 @@ class _Task:
     views: Sequence[Picture]
     geometry: Geometry | None
     masks: Mapping[int, Mask]
+    drawn: Mapping[int, Drawn]
     options: RunOptions
     deadline_s: float | None
 

@@ -22,6 +22,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
 from gcar_deploy.imaging.net import load_segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
+from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, load_predictor, quick_tree
@@ -70,13 +71,14 @@ def inspect_files(
     geom: Geometry | None,
     options: RunOptions | None = None,
     masks: Mapping[int, Mask] | None = None,
+    drawn: Mapping[int, Drawn] | None = None,
 ) -> Inspection:
     """Read and judge; errors end the inspection and stand in it, nothing is raised."""
     options = options or RunOptions()
     found = Inspection()
     try:
         check_options(options)
-        angiograms, grid, warnings = prepare(pictures, geom, options, masks)
+        angiograms, grid, warnings = prepare(pictures, geom, options, masks, drawn)
         found.warnings += warnings
         carms = [a.carm for a in angiograms]
         for a in angiograms:
@@ -108,6 +110,7 @@ def inspect_files(
         segmenter, missing = asked_network(angiograms, options.imaging, loaded)
         found.warnings += missing
         landmark_pixels(options.landmarks, carms)  # named as the user numbers the views
+        landmark_pixels(options.ostia, carms)
         frame = own_frame(carms, [a.sha256 for a in angiograms])
         own, asked = in_own_frame(frame, angiograms, options)
         for k, angiogram in zip(frame.order, own, strict=True):

@@ -18,7 +18,7 @@ from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.vessels import find_vessels
 from gcar_deploy.measure import from_inlets
-from gcar_deploy.pose import landmark_pixels, register
+from gcar_deploy.pose import landmark_pixels, marked_places, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import check_candidates, check_tree, check_views, judge
 from gcar_deploy.reconstruction import Reconstruction
@@ -75,6 +75,7 @@ def reconstruct(
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
     check_options(options)
     landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
+    landmark_pixels(options.ostia, [a.carm for a in angiograms])
     watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
                       used_s=used_s)  # fmt: skip
     frame = own_frame([a.carm for a in angiograms], [a.sha256 for a in angiograms])
@@ -118,6 +119,7 @@ def _reconstructed(
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(),
         ).or_fail()  # fmt: skip
+        refined, missed = refined.without(options.deleted_mm)
         keep(refined)
     with watch.stage("tree", keep_if_late=True):
         check_tree(refined.tree, options.quality)
@@ -125,11 +127,13 @@ def _reconstructed(
     with watch.stage("quality", keep_if_late=True), placed.hinting():
         for stage in (vessels, placed, centers, refined):
             findings += stage.findings
+        findings += missed
         judged = judge(
             refined.tree, placed.views, findings, options,
             disagreement=placed.disagreement, evidence=centers.evidence,
         )  # fmt: skip
-        tree = from_inlets(refined.tree)
+        ostia = marked_places(options.ostia, [view.carm for view in placed.views])
+        tree = from_inlets(refined.tree, ostia)
     return Reconstruction(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=placed.views, poses=placed.poses,

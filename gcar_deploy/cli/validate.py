@@ -32,7 +32,7 @@ def validate(order: Order, talk: Talk) -> None:
     from gcar_deploy.inspection import inspect_files
 
     options = order.options(RunOptions())
-    found = inspect_files(order.views, order.geometry, options, order.masks)
+    found = inspect_files(order.views, order.geometry, options, order.masks, order.drawn)
     click.echo(json.dumps(found.to_dict()) if talk.as_json else "\n".join(_lines(found)))
     if found.error is not None:
         raise found.error

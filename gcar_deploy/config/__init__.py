@@ -76,3 +76,7 @@ class RunOptions:
     quality: QualityOptions = dataclasses.field(default_factory=QualityOptions)
     #: points marked in the pictures, which hold the views to each other
     landmarks: tuple[Landmark, ...] = ()
+    #: where arteries begin, marked in two views or more
+    ostia: tuple[Landmark, ...] = ()
+    #: a place on each branch that is to go, mm LPS, in the order of deletion
+    deleted_mm: tuple[tuple[float, float, float], ...] = ()

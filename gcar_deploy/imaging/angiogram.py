@@ -38,6 +38,8 @@ class Angiogram:
         Where the file itself says that there is a picture (shutters); None for everywhere.
     mask : (rows, cols) bool or None
         Vessel as the user says; it wins over anything found in the pixels.
+    erased, painted : (rows, cols) bool or None
+        What the user takes from, and adds to, the vessels that are found.
     """
 
     view_id: str
@@ -48,10 +50,12 @@ class Angiogram:
     sha256: str
     valid: Mask | None = None
     mask: Mask | None = None
+    erased: Mask | None = None
+    painted: Mask | None = None
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)
-        for array in (self.valid, self.mask):
+        for array in (self.valid, self.mask, self.erased, self.painted):
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
 

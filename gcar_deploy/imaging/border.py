@@ -51,7 +51,7 @@ def _border(pixels: Image, even: Array, same: Array) -> int:
 
 
 def cut_out(angiogram: Angiogram, box: Box) -> Angiogram:
-    """Return the part of a picture within a box, with its view."""
+    """Return the part of a picture within a box, with its view and without what was drawn in it."""
     top, bottom, left, right = box
     rows, columns = slice(top, bottom), slice(left, right)
     valid = angiogram.valid
@@ -60,6 +60,8 @@ def cut_out(angiogram: Angiogram, box: Box) -> Angiogram:
         carm=_cropped(angiogram.carm, box),
         pixels=np.ascontiguousarray(angiogram.pixels[rows, columns]),
         valid=None if valid is None else valid[rows, columns],
+        erased=None,
+        painted=None,
     )
 
 

@@ -14,6 +14,7 @@ from gcar_deploy.imaging import calibrate, enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.border import cut_out, put_back, shown_box
+from gcar_deploy.imaging.edits import edited
 from gcar_deploy.imaging.fusion import fused
 from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
@@ -68,10 +69,18 @@ def extract_vessels(
     Raises
     ------
     RefusedError
-        No vessel: blank, constant, saturated, or nothing that stands out of the noise.
+        No vessel: blank, constant, saturated, nothing that stands out of the noise, or all of
+        it erased.
     GeometryError
         ``path_length`` without ``mm_per_count``; it or ``mask`` declared dark.
     """
+    return edited(_found(angiogram, options, segmenter), angiogram)
+
+
+def _found(
+    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
+) -> VesselImage:
+    """Find vessels, whatever was drawn in the picture."""
     pixels = angiogram.pixels
     if not float(pixels.max()) > float(pixels.min()):
         raise _nothing(angiogram, f"every pixel is {float(pixels.flat[0]):g}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import Landmark, RunOptions
 from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.imaging.angiogram import Angiogram
 
@@ -13,9 +13,18 @@ from gcar_deploy.imaging.angiogram import Angiogram
 def in_own_frame(
     frame: OwnFrame, angiograms: Sequence[Angiogram], options: RunOptions
 ) -> tuple[list[Angiogram], RunOptions]:
-    """Return pictures and landmarks in the scene's own order, the views in its coordinates."""
+    """Return pictures and marks in the scene's own order, views and places in its coordinates."""
     seen = [
         dataclasses.replace(angiograms[k], carm=frame.carm(angiograms[k].carm)) for k in frame.order
     ]
-    marks = tuple(tuple(mark[k] for k in frame.order) for mark in options.landmarks)
-    return seen, dataclasses.replace(options, landmarks=marks)
+
+    def ordered(marks: Sequence[Landmark]) -> tuple[Landmark, ...]:
+        return tuple(tuple(mark[k] for k in frame.order) for mark in marks)
+
+    x0, y0, z0 = (float(value) for value in frame.origin_mm)
+    return seen, dataclasses.replace(
+        options,
+        landmarks=ordered(options.landmarks),
+        ostia=ordered(options.ostia),
+        deleted_mm=tuple((x - x0, y - y0, z - z0) for x, y, z in options.deleted_mm),
+    )

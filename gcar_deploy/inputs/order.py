@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,16 +22,35 @@ from gcar_deploy.config import (
 from gcar_deploy.config.ranges import Range, check_field, check_number
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.files import read_text
-from gcar_deploy.geometry.fields import check_choice, check_object, number, quote, read_json, whole
+from gcar_deploy.geometry.fields import (
+    check_choice,
+    check_object,
+    number,
+    numbers,
+    quote,
+    read_json,
+    whole,
+)
+from gcar_deploy.inputs.drawn import (
+    Drawn,
+    Place,
+    Stroke,
+    by_view,
+    drawn_by_view,
+    parse_edits,
+    parse_point,
+    parse_regions,
+)
 
 SCHEMA = "gcar-order/1"
 #: pictures of one order
 MOST_VIEWS = 16
-#: bytes of an order as JSON: a geometry may stand in it, and landmarks
-MAX_BYTES = 256 * 1024
+#: bytes of an order as JSON: a geometry may stand in it, and what was drawn in the pictures
+MAX_BYTES = 1024 * 1024
+#: a branch to be deleted is named by a place within so much of the isocentre, mm
+_FARTHEST_MM = 2000.0
 POSES = ("auto", "off")
 EXTRAS = ("glb", "dicom-stl")
-_NUMBER = re.compile(r"0|[1-9][0-9]?", re.ASCII)
 _CHOICES = {
     "pose": POSES, "segmenter": SEGMENTERS, "predictor": PREDICTORS, "refiner": REFINERS,
 }  # fmt: skip
@@ -48,6 +66,10 @@ class Order:
     geometry : file or content of a ``geom.json``; None where DICOM headers tell it
     masks : number of the view, from 1 -> file of its vessel mask
     landmarks : points marked in the pictures, (column, row) in each view or None
+    edits : number of the view, from 1 -> strokes that erase or paint vessel, in their order
+    regions : number of the view -> corners of the part that is looked at
+    ostia : where arteries begin, points as of ``landmarks``
+    deleted_mm : a place on each branch that is to go, mm LPS, in the order of deletion
     frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
     pixel_spacing_mm, sod_mm : for DICOM that does not say it, at the detector
     pose : ``auto`` or ``off``
@@ -63,6 +85,10 @@ class Order:
     geometry: Path | Mapping[str, Any] | None = None
     masks: Mapping[int, Path] = dataclasses.field(default_factory=dict)
     landmarks: tuple[Landmark, ...] | None = None
+    edits: Mapping[int, tuple[Stroke, ...]] = dataclasses.field(default_factory=dict)
+    regions: Mapping[int, tuple[Place, ...]] = dataclasses.field(default_factory=dict)
+    ostia: tuple[Landmark, ...] | None = None
+    deleted_mm: tuple[tuple[float, float, float], ...] | None = None
     frames: tuple[int | None, ...] | None = None
     pixel_spacing_mm: float | None = None
     sod_mm: float | None = None
@@ -105,6 +131,11 @@ class Order:
             found["geometry"] = self.geometry
         return found | {f"mask{k}": path for k, path in self.masks.items()}
 
+    @property
+    def drawn(self) -> dict[int, Drawn]:
+        """Number of the view -> what was drawn in it."""
+        return drawn_by_view(self.edits, self.regions)
+
     def with_files(self, change: Callable[[str, Path], Path]) -> Order:
         """Return the order with each of its files replaced by ``change(name, path)``."""
         new = {name: change(name, path) for name, path in self.files.items()}
@@ -131,7 +162,7 @@ class Order:
             pose=dataclasses.replace(base.pose, **pose),
             predict=dataclasses.replace(base.predict, **_given(self, "predictor")),
             refine=dataclasses.replace(base.refine, **_given(self, "refiner")),
-            **_given(self, "landmarks"),
+            **_given(self, "landmarks", "ostia", "deleted_mm"),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -197,9 +228,10 @@ def check_views(order: Order) -> None:
         raise UsageError(f"{count} picture given; two or more are needed")
     if count > MOST_VIEWS:
         raise UsageError(f"{count} pictures given; at most {MOST_VIEWS} are taken")
-    for k in order.masks:
-        if not 1 <= k <= count:
-            raise UsageError(f"mask {k}: there are views 1 .. {count}")
+    for what, named in (("mask", order.masks), ("edits", order.edits), ("region", order.regions)):
+        for k in named:
+            if not 1 <= k <= count:
+                raise UsageError(f"{what} {k}: there are views 1 .. {count}")
 
 
 def _order(values: Any) -> Order:
@@ -213,6 +245,8 @@ def _order(values: Any) -> Order:
     given["views"] = tuple(_path("views", name) for name in names)
     readers: dict[str, Callable[[str, Any], Any]] = {
         "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,
+        "edits": parse_edits, "regions": parse_regions, "ostia": _landmarks,
+        "deleted_mm": _deleted,
         "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
         "force": _truth, "out": _path, "extras": _texts,
     }  # fmt: skip
@@ -245,22 +279,22 @@ def _geometry(key: str, value: Any) -> Any:
 
 
 def _masks(key: str, value: Any) -> dict[int, Path]:
-    if not isinstance(value, dict) or not all(_NUMBER.fullmatch(k) for k in value):
-        raise UsageError(f"{key} = {quote(value)} must be an object: number of the view -> file")
-    return {int(k): _path(f"{key}.{k}", name) for k, name in value.items()}
+    return {k: _path(f"{key}.{k}", name) for k, name in by_view(key, value, "file").items()}
 
 
 def _landmarks(key: str, value: Any) -> tuple[Landmark, ...]:
     return tuple(
-        tuple(None if point is None else _point(key, point) for point in _list(key, one, "points"))
-        for one in _list(key, value, "landmarks")
+        tuple(
+            None if point is None else parse_point(key, point)
+            for point in _list(key, one, "points")
+        )
+        for one in _list(key, value, "points marked in the views")
     )
 
 
-def _point(key: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise UsageError(f"{key}: {quote(value)} must be [column, row], or null where unseen")
-    return number(key, value[0]), number(key, value[1])
+def _deleted(key: str, value: Any) -> tuple[tuple[float, float, float], ...]:
+    places = [numbers(key, one, 3, _FARTHEST_MM) for one in _list(key, value, "places [x, y, z]")]
+    return tuple((x, y, z) for x, y, z in places)
 
 
 def _frames(key: str, value: Any) -> tuple[int | None, ...]:
@@ -287,6 +321,8 @@ def _given(order: Order, *keys: str) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, Stroke):
+        return value.to_dict()
     if isinstance(value, tuple):
         return [_plain(one) for one in value]
     if isinstance(value, Mapping):

@@ -21,6 +21,7 @@ from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, p
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half
 from gcar_deploy.imaging.read import read_picture
+from gcar_deploy.inputs.drawn import Drawn
 
 #: a file, an array of counts, or a picture that already knows its C-arm
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
@@ -36,6 +37,7 @@ def prepare(
     geometry: Geometry | None,
     options: RunOptions,
     masks: Mapping[int, Mask] | None = None,
+    drawn: Mapping[int, Drawn] | None = None,
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pair pictures with their views.
 
@@ -45,6 +47,7 @@ def prepare(
     geometry : where they were taken from; None where DICOM headers say it
     options : RunOptions, of which ``dicom`` and ``imaging.limits`` are used
     masks : number of the view, from 1 -> vessel mask (picture of its size)
+    drawn : number of the view -> strokes and region of interest
 
     Returns
     -------
@@ -53,7 +56,7 @@ def prepare(
     Raises
     ------
     UsageError
-        Fewer than two pictures, or a mask of no view.
+        Fewer than two pictures, or a mask or strokes of no view.
     GeometryError
         Not as many pictures as views, or sizes at odds.
     ImageError
@@ -69,7 +72,35 @@ def prepare(
         angiograms, grid, notes = _by_scene(views, _scene(geometry), options)
     masks = masks or {}
     angiograms = with_masks(angiograms, masks, options.imaging.limits)
-    return angiograms, grid, notes + [f"view {k}: the vessel mask is the user's" for k in masks]
+    notes += [f"view {k}: the vessel mask is the user's" for k in masks]
+    for k, lines in (drawn or {}).items():
+        angiograms[_index(k, "edits", angiograms)] = with_drawn(angiograms[k - 1], lines)
+        notes += [f"view {k}: {text}" for text in _said(lines)]
+    return angiograms, grid, notes
+
+
+def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
+    """Give a picture what was drawn in it."""
+    shape = angiogram.pixels.shape
+    marks, inside = drawn.marks(shape), drawn.inside(shape)
+    if marks is not None:
+        angiogram = dataclasses.replace(angiogram, erased=marks[0], painted=marks[1])
+    if inside is not None:
+        valid = inside if angiogram.valid is None else inside & angiogram.valid
+        angiogram = dataclasses.replace(angiogram, valid=valid)
+    return angiogram
+
+
+def _said(drawn: Drawn) -> list[str]:
+    count = {do: sum(one.do == do for one in drawn.strokes) for do in ("erase", "paint")}
+    out = [f"{n} strokes of the user {do} vessel" for do, n in count.items() if n]
+    return out + (["only the user's region of interest is looked at"] if drawn.region else [])
+
+
+def _index(number: int, what: str, angiograms: Sequence[Angiogram]) -> int:
+    if not 1 <= number <= len(angiograms):
+        raise UsageError(f"{what} {number}: there are views 1 .. {len(angiograms)}")
+    return number - 1
 
 
 def with_masks(
@@ -88,10 +119,9 @@ def with_masks(
     """
     out = list(angiograms)
     for number, given in masks.items():
-        if not 1 <= number <= len(out):
-            raise UsageError(f"mask {number}: there are views 1 .. {len(out)}")
+        place = _index(number, "mask", out)
         array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
-        shape = out[number - 1].pixels.shape
+        shape = out[place].pixels.shape
         if array.shape != shape:
             raise ImageError(
                 f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
@@ -99,7 +129,7 @@ def with_masks(
         mask = above_half(array)
         if not mask.any() or mask.mean() > 0.9:
             raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
-        out[number - 1] = dataclasses.replace(out[number - 1], mask=mask)
+        out[place] = dataclasses.replace(out[place], mask=mask)
     return out
 
 

@@ -2,17 +2,20 @@
 
 The rule, for each component by itself (a left and a right tree each have their own):
 
+0. the free end nearest to an ostium that a person marked, where one lies within ``MARKED_MM``;
 1. the ostium of the left main or right coronary artery, where anatomy names one
    (``measure.naming``, with at least the probability that a name needs);
 2. else the thickest free end, its radius averaged over the last ``routes.END_MM`` mm: coronary
    arteries taper from the ostium on (Murray, Proc Natl Acad Sci 12:207, 1926);
 3. else, in a ring without a free end, the thickest node.
 
-The second and third look at radii and lengths alone, so that a mirrored or turned tree keeps its
+The last two look at radii and lengths alone, so that a mirrored or turned tree keeps its
 inlet.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -20,29 +23,36 @@ from gcar_deploy.measure.naming import read_anatomy
 from gcar_deploy.measure.routes import end_radii
 from gcar_deploy.tree.rooted import rooted
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Points
 
 #: radii closer than this are equal, and the lower node number decides: rounding must not, mm
 _SAME_MM = 1e-6
+#: a marked ostium and the end of its artery may be so far apart: pictures seldom show the very
+#: mouth, and a click is off by a pixel or two
+MARKED_MM = 15.0
 
 
-def from_inlets(tree: Tree) -> Tree:
+def from_inlets(tree: Tree, marked_mm: Points | None = None) -> Tree:
     """Run every branch from its inlet to its end and number the branches from there.
 
     Parameters
     ----------
     tree : Tree, mm LPS; points and radii stay as they are
+    marked_mm : (m, 3) ostia that a person marked
 
     Returns
     -------
     Tree, see ``tree.rooted``
     """
-    return rooted(tree, inlets(tree))
+    return rooted(tree, inlets(tree, marked_mm))
 
 
-def inlets(tree: Tree) -> tuple[int, ...]:
+def inlets(tree: Tree, marked_mm: Points | None = None) -> tuple[int, ...]:
     """Node of the inlet of each component that has a branch, by the rule above."""
     named = set(read_anatomy(tree).inlets)
     free = end_radii(tree)
+    marked = {node for place in (() if marked_mm is None else marked_mm)
+              if (node := _end_at(tree, free, place)) is not None}  # fmt: skip
     thickest: dict[int, float] = {}
     for branch in tree.branches:
         for node, radius in (
@@ -54,7 +64,15 @@ def inlets(tree: Tree) -> tuple[int, ...]:
     out = []
     for k in np.unique([component[node] for node in thickest]).tolist():
         own = [node for node in sorted(thickest) if component[node] == k]
-        ends = [node for node in own if node in named] or [node for node in own if node in free]
+        known = ([n for n in own if n in wanted] for wanted in (marked, named, free))
+        ends = next((found for found in known if found), [])
         radii = free if ends else thickest
         out.append(max(ends or own, key=lambda n: (round(radii[n] / _SAME_MM), -n)))
     return tuple(out)
+
+
+def _end_at(tree: Tree, free: Mapping[int, float], place_mm: Points) -> int | None:
+    """Free end nearest to a place, None where none lies within ``MARKED_MM``."""
+    nodes = sorted(free)
+    gaps = [float(np.linalg.norm(tree.nodes_mm[node] - place_mm)) for node in nodes]
+    return nodes[int(np.argmin(gaps))] if nodes and min(gaps) <= MARKED_MM else None

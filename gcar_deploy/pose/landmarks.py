@@ -9,7 +9,8 @@ import numpy as np
 from gcar_deploy.config import Landmark
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.types import Array
+from gcar_deploy.geometry.epipolar import triangulate
+from gcar_deploy.types import Array, Points
 
 
 def landmark_pixels(landmarks: Sequence[Landmark], carms: Sequence[CArm]) -> Array:
@@ -48,3 +49,18 @@ def landmark_pixels(landmarks: Sequence[Landmark], carms: Sequence[CArm]) -> Arr
         if np.isfinite(out[m, :, 0]).sum() < 2:
             raise UsageError(f"landmark {m + 1} is marked in one view; two or more are needed")
     return out
+
+
+def marked_places(marks: Sequence[Landmark], carms: Sequence[CArm]) -> Points:
+    """(m, 3) places in space of points that were marked, mm: nearest to their rays.
+
+    Parameters
+    ----------
+    marks : as ``landmark_pixels``
+    carms : V views, corrections built in
+    """
+    out = []
+    for pixels in landmark_pixels(marks, carms):
+        seen = [k for k in range(len(carms)) if np.isfinite(pixels[k, 0])]
+        out.append(triangulate([carms[k] for k in seen], [pixels[k][None] for k in seen])[0][0])
+    return np.array(out).reshape(-1, 3)

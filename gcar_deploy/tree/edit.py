@@ -16,6 +16,29 @@ def kept_branches(tree: Tree, keep: Array) -> Tree:
     return merged(dataclasses.replace(tree, branches=branches))
 
 
+def without_branch_at(tree: Tree, place_mm: Array, within_mm: float) -> Tree | None:
+    """Drop the branch that passes nearest to a place; None where none passes near enough.
+
+    Parameters
+    ----------
+    tree : Tree
+    place_mm : (3,) in the tree's coordinates
+    within_mm : most distance from a branch's centreline, or its radius where that is more
+
+    Returns
+    -------
+    Tree, joined where two branches are left at a node, or None
+    """
+    gaps = [np.linalg.norm(branch.points_mm - place_mm, axis=1) for branch in tree.branches]
+    if not gaps:
+        return None
+    nearest = int(np.argmin([gap.min() for gap in gaps]))
+    at = int(gaps[nearest].argmin())
+    if gaps[nearest][at] > max(within_mm, float(tree.branches[nearest].radius_mm[at])):
+        return None
+    return kept_branches(tree, np.arange(len(tree.branches)) != nearest)
+
+
 def merged(tree: Tree) -> Tree:
     """Join branches that meet two at a node, and renumber the nodes that are left."""
     branches = list(tree.branches)

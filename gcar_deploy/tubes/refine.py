@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gcar_deploy.config import REFINERS, RefineOptions
 from gcar_deploy.config.ranges import check_choice
@@ -17,6 +18,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.stopwatch import Budget
 from gcar_deploy.tree.centerline import build_tree
+from gcar_deploy.tree.edit import without_branch_at
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
@@ -25,6 +27,8 @@ from gcar_deploy.tubes.volume import tube_volume
 from gcar_deploy.types import Array, Volume
 
 OnProgress = Callable[[float], None]
+#: a place on a branch that is to go may be so far off its centreline, mm
+DELETED_WITHIN_MM = 2.0
 _FINDINGS = {
     "late": "the deadline left no time to refine",
     "stopped": "the deadline ended the refinement early",
@@ -66,6 +70,32 @@ class Refined:
     def findings(self) -> tuple[str, ...]:
         """Reasons for ``degraded``."""
         return (_FINDINGS[self.status],) if self.status in _FINDINGS else ()
+
+    def without(self, places_mm: Sequence[tuple[float, float, float]]) -> tuple[Refined, list[str]]:
+        """Drop the branches that a person named by a place on each, one after the other.
+
+        Parameters
+        ----------
+        places_mm : places in the tree's coordinates
+
+        Returns
+        -------
+        what is left, and a sentence for each place that no branch passes (a finding)
+        """
+        tree, missed = self.tree, []
+        for number, place in enumerate(places_mm, start=1):
+            left = without_branch_at(tree, np.array(place), DELETED_WITHIN_MM)
+            if left is None:
+                missed.append(
+                    f"deleted_mm {number}: no branch passes within {DELETED_WITHIN_MM:g} mm of it"
+                )
+            tree = left or tree
+        if tree is self.tree:
+            return self, missed
+        gaussians = gaussians_on_tree(tree)
+        if self.refiner == "paper":
+            gaussians = _nearer_to(tree, self.tree, self.gaussians)
+        return dataclasses.replace(self, tree=tree, gaussians=gaussians), missed
 
     def or_fail(self) -> Refined:
         """Return itself; raise NumericalError where the refinement failed."""
@@ -147,6 +177,22 @@ def refined_volume(
         refined.centers,
         options.tube.edge_blur_mm,
         refined.model_mm,
+    )
+
+
+def _nearer_to(left: Tree, whole: Tree, gaussians: Gaussians) -> Gaussians:
+    """Gaussians that stand on the branches that are left, as near as on the whole tree."""
+    if not left.branches:
+        return gaussians_on_tree(left)
+    kept = cKDTree(left.points()).query(gaussians.means_mm)[0]
+    all_ = cKDTree(whole.points()).query(gaussians.means_mm)[0]
+    keep = kept <= all_ + 1e-9
+    return Gaussians(
+        means_mm=gaussians.means_mm[keep],
+        scales_mm=gaussians.scales_mm[keep],
+        quaternions_wxyz=gaussians.quaternions_wxyz[keep],
+        intensity=gaussians.intensity[keep],
+        sigma_mm=None if gaussians.sigma_mm is None else gaussians.sigma_mm[keep],
     )
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions, check_options
 from gcar_deploy.errors import UsageError
+from gcar_deploy.inputs.drawn import DOES, Stroke
 from gcar_deploy.inputs.order import (
     EXTRAS,
     KEYS,
@@ -24,6 +25,16 @@ from gcar_deploy.inputs.order import (
 
 _names = st.text("abcäö 1./-", min_size=1, max_size=12).map(Path)
 _points = st.none() | st.tuples(st.floats(0, 4000), st.floats(0, 4000))
+_corners = st.lists(st.tuples(st.floats(0, 4000), st.floats(0, 4000)), min_size=3, max_size=5).map(
+    tuple
+)
+_strokes = st.builds(
+    Stroke,
+    do=st.sampled_from(DOES),
+    points=_corners,
+    width_px=st.none() | st.floats(1, 400),
+)
+_places = st.tuples(*[st.floats(-200, 200)] * 3)
 
 
 @st.composite
@@ -38,6 +49,10 @@ def orders(draw) -> Order:
         geometry=draw(st.none() | _names | st.just({"schema": "gcar-geometry/1", "views": []})),
         masks=draw(st.dictionaries(numbers, _names, max_size=3)),
         landmarks=None if pose == "off" else draw(st.none() | landmarks),
+        edits=draw(st.dictionaries(numbers, st.lists(_strokes, min_size=1, max_size=3).map(tuple))),
+        regions=draw(st.dictionaries(numbers, _corners)),
+        ostia=draw(st.none() | landmarks),
+        deleted_mm=draw(st.none() | st.lists(_places, min_size=1, max_size=3).map(tuple)),
         frames=draw(st.none() | st.lists(st.none() | st.integers(1, 900), min_size=1).map(tuple)),
         pixel_spacing_mm=draw(st.none() | st.floats(0.02, 10)),
         sod_mm=draw(st.none() | st.floats(300, 5000)),
@@ -74,6 +89,8 @@ def test_every_order_makes_options_that_pass_their_checks(order):
         ("sod_mm", options.dicom.sod_mm),
         ("pixel_spacing_mm", options.dicom.pixel_spacing_mm),
         ("landmarks", options.landmarks),
+        ("ostia", options.ostia),
+        ("deleted_mm", options.deleted_mm),
     ):
         if getattr(order, key) is not None:
             assert told == getattr(order, key), key
@@ -112,6 +129,17 @@ BASE = {"views": ["a", "b"]}
         ({"landmarks": [[[1, 2, 3], None]]}, "column, row"),
         ({"landmarks": [[["1", 2], None]]}, "landmarks = '1'"),
         ({"landmarks": [[[1, 2], [3, 4]]], "pose": "off"}, "pose off"),
+        ({"edits": {"3": []}}, "edits 3: there are views 1 .. 2"),
+        ({"edits": {"1": [{"do": "cut", "points": [[1, 2]]}]}}, "edits.1[0].do = 'cut'"),
+        ({"edits": {"1": [{"do": "erase", "points": [[1, 2]]}]}}, "edits.1[0].points must be"),
+        ({"edits": {"1": [{"do": "erase", "width_px": 0, "points": [[1, 2]]}]}}, "width_px = 0"),
+        ({"edits": {"1": [{"do": "erase", "with": 3, "points": []}]}}, "unknown key 'with'"),
+        ({"edits": [1]}, "number of the view"),
+        ({"regions": {"1": [[1, 2], [3, 4]]}}, "regions.1 must be a list of 3"),
+        ({"regions": {"1": [[1, 2], [3, 4], [1e9, 0]]}}, "lies in no picture"),
+        ({"ostia": [[[1, 2, 3], None]]}, "ostia: [1, 2, 3] must be [column, row]"),
+        ({"deleted_mm": [[1, 2]]}, "deleted_mm = [1, 2] must be 3 numbers"),
+        ({"deleted_mm": [[1, 2, 1e6]]}, "outside -2000 .. 2000 mm"),
         ({"frames": [0]}, "frames = 0"),
         ({"frames": 7}, "list of frames"),
         ({"frames": [1.5]}, "whole number"),

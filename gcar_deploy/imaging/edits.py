@@ -1,0 +1,55 @@
+"""Vessels as they were found, less what the user erased, with what the user painted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gcar_deploy.errors import RefusedError
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.mask_path import mask_path
+
+
+def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
+    """Apply the strokes of a picture to its vessels.
+
+    What is erased holds no vessel: its path is 0, which the fit believes. What is painted is
+    vessel as thick as it is wide, except in pictures of path lengths, which tell the path
+    themselves.
+
+    Parameters
+    ----------
+    found : VesselImage of ``angiogram``
+    angiogram : Angiogram with ``erased`` and ``painted``
+
+    Raises
+    ------
+    RefusedError
+        Nothing is left.
+    """
+    erased, painted = angiogram.erased, angiogram.painted
+    if erased is None or painted is None:
+        return found
+    painted = painted & found.valid
+    mask = (found.mask & ~erased) | painted
+    line, path = found.skeleton & ~erased, np.where(erased, np.float32(0), found.path_mm)
+    if painted.any():
+        new = painted & (path <= 0)
+        scale = angiogram.intensity.mm_per_count
+        if found.kind == "path_length" and scale is not None:
+            path = np.where(new, angiogram.pixels * np.float32(scale), path)
+        else:
+            path = np.where(new, mask_path(mask, angiogram.carm.pixel_at_isocenter_mm), path)
+        # Lines elsewhere stay as they were found; where paint meets them they are drawn anew.
+        line = np.where(painted, skel.skeletonize(mask), line)
+    if not line.any():
+        raise RefusedError(f"no vessel is left in view {found.view_id} after what was erased")
+    return dataclasses.replace(
+        found,
+        mask=mask,
+        skeleton=line,
+        path_mm=np.asarray(path, dtype=np.float32),
+        alone=None if found.alone is None else edited(found.alone, angiogram),
+    )
