@@ -31,6 +31,7 @@ RUNTIME_FLOORS = (
     "result",
     "engine",
     "inspection worker batch bench",
+    "workbench",
     "cli",
 )
 EXPORT_FLOORS = ("scenes", "training", "shipping methods", "evaluate", "studies", "cli")
@@ -57,8 +58,8 @@ WALLED = {
     },
     "distributed": {"batch/pools.py"},
     "pynetdicom": {"worker/listen.py", "worker/send.py"},
-    "flask": {"worker/http.py"},
-    "waitress": {"worker/http.py"},
+    "flask": {"worker/http.py", "worker/loopback.py", "workbench/http.py"},
+    "waitress": {"worker/loopback.py"},
 }
 
 

@@ -153,7 +153,8 @@ def _serve_lines(make_queue: Any, allowed: Any) -> None:
 
 def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib: int) -> None:
     try:
-        from gcar_deploy.worker.http import LOOPBACK, create_app, listen
+        from gcar_deploy.worker.http import create_app
+        from gcar_deploy.worker.loopback import LOOPBACK, listen
 
         fresh = token is None
         token = token or secrets.token_urlsafe(32)

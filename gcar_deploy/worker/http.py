@@ -1,14 +1,8 @@
-"""HTTP face of the worker: JSON on the loopback interface, behind a token.
-
-Flask and waitress (extra ``serve``): the handlers are as synchronous as the engine; waitress
-receives a whole request, within its limits of size and time, before a thread sees it.
-"""
+"""HTTP face of the worker: JSON on the loopback interface, behind a token."""
 
 from __future__ import annotations
 
 import dataclasses
-import hmac
-import logging
 import shutil
 import threading
 from http import HTTPStatus
@@ -17,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flask import Flask, Response, jsonify, request, send_from_directory, url_for
-from waitress import create_server
 from werkzeug.datastructures import FileStorage
-from werkzeug.exceptions import HTTPException
 
 from gcar_deploy import __version__
 from gcar_deploy.errors import GcarError, GeometryError, UsageError
@@ -29,21 +21,15 @@ from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
+from gcar_deploy.worker.loopback import THREADS, error, guard, tell_errors
 from gcar_deploy.worker.orders import Received, new_scratch, placed, receive, scratch_file
 
-_log = logging.getLogger(__name__)
-LOOPBACK = "127.0.0.1"
-#: names by which a browser's page under someone else's name cannot call the worker
-_HOSTS = ["127.0.0.1", "localhost"]
 #: answered without a token: nothing in them is anybody's
 _OPEN = ("/health", "/openapi.json")
 #: the longest that a request waits for its job, seconds
 MOST_WAIT_S = 60.0
 #: geometry and options of one request, bytes
 _MOST_FIELDS = 4 * 2**20
-#: threads of the server; half of them may wait for jobs
-THREADS = 8
-_STATUS_OF = {2: 400, 3: 422, 4: 422, 5: 500, 6: 422, 7: 503, 8: 500}
 
 
 def create_app(
@@ -63,12 +49,11 @@ def create_app(
         MAX_CONTENT_LENGTH=body_mib * 2**20,
         MAX_FORM_MEMORY_SIZE=_MOST_FIELDS,
         MAX_FORM_PARTS=2 * MOST_VIEWS + 2,
-        TRUSTED_HOSTS=_HOSTS,
     )
     app.json.sort_keys = False  # type: ignore[attr-defined]
     waiters = threading.BoundedSemaphore(THREADS // 2)
-    _guard(app, token)
-    _errors(app)
+    guard(app, token, _OPEN.__contains__)
+    tell_errors(app)
 
     @app.get("/health")
     def health() -> Any:
@@ -87,84 +72,37 @@ def create_app(
         except QueueFullError:
             received.clean()
             raise
-        _wait(job, waiters)
+        wait_for(job, waiters)
         place = url_for("job_of", job_id=job.id)
-        return _shown(job, queue), HTTPStatus.ACCEPTED if job.open else 200, {"Location": place}
+        return shown(job, queue), HTTPStatus.ACCEPTED if job.open else 200, {"Location": place}
 
     @app.get("/v1/jobs/<job_id>")
     def job_of(job_id: str) -> Any:
-        job = _found(queue, job_id)
-        _wait(job, waiters)
-        return _shown(job, queue)
+        job = found_job(queue, job_id)
+        wait_for(job, waiters)
+        return shown(job, queue)
 
     @app.delete("/v1/jobs/<job_id>")
     def cancel(job_id: str) -> Any:
-        job = _found(queue, job_id)
+        job = found_job(queue, job_id)
         if job.open:
             queue.cancel(job)
-            return _shown(job, queue), HTTPStatus.ACCEPTED
+            return shown(job, queue), HTTPStatus.ACCEPTED
         queue.forget(job)
         return "", HTTPStatus.NO_CONTENT
 
     @app.get("/v1/jobs/<job_id>/files/<name>")
     def file_of(job_id: str, name: str) -> Any:
-        job = _found(queue, job_id)
+        job = found_job(queue, job_id)
         if job.state != DONE or job.folder is None or name not in _files(job):
-            return _error(f"job {job_id} has no file {name!r}", 2, HTTPStatus.NOT_FOUND)
+            return error(f"job {job_id} has no file {name!r}", 2, HTTPStatus.NOT_FOUND)
         return send_from_directory(job.folder, name, max_age=0)
 
     return app
 
 
-def _guard(app: Flask, token: str) -> None:
-    expected = f"Bearer {token}".encode()
-
-    @app.before_request
-    def check() -> Any:
-        # Pages in a browser have no business here, whatever name they reached us by.
-        if "Origin" in request.headers:
-            return _error("requests of web pages are not answered", 2, HTTPStatus.FORBIDDEN)
-        if request.host.rpartition(":")[0] not in _HOSTS and request.host not in _HOSTS:
-            return _error("unknown Host", 2, HTTPStatus.MISDIRECTED_REQUEST)
-        given = request.headers.get("Authorization", "").encode()
-        if request.path not in _OPEN and not hmac.compare_digest(given, expected):
-            answer = _error("Authorization: Bearer TOKEN is missing or wrong", 2, 401)
-            answer.headers["WWW-Authenticate"] = "Bearer"
-            return answer
-        return None
-
-    @app.after_request
-    def quiet(answer: Response) -> Response:
-        answer.headers["Cache-Control"] = "no-store"
-        answer.headers["X-Content-Type-Options"] = "nosniff"
-        return answer
-
-
-def _errors(app: Flask) -> None:
-    @app.errorhandler(GcarError)
-    def of_gcar(error: GcarError) -> Response:
-        return _error(str(error), error.exit_code, _STATUS_OF.get(error.exit_code, 500))
-
-    @app.errorhandler(HTTPException)
-    def of_http(error: HTTPException) -> Response:
-        return _error(f"{error.name}: {error.description}", 2, error.code or 500)
-
-    @app.errorhandler(Exception)
-    def of_bug(error: Exception) -> Response:
-        _log.error("internal error: %s", type(error).__name__)
-        _log.debug("internal error", exc_info=True)
-        return _error(f"internal error: {type(error).__name__}", 1, 500)
-
-
-def _error(message: str, exit_code: int, status: int) -> Response:
-    answer = jsonify(error={"message": " ".join(message.split()), "exit_code": exit_code})
-    answer.status_code = int(status)
-    if status == HTTPStatus.SERVICE_UNAVAILABLE:
-        answer.headers["Retry-After"] = "2"
-    return answer
-
-
-def _found(queue: JobQueue, job_id: str) -> Job:
+def found_job(queue: JobQueue, job_id: str) -> Job:
+    """Return a job that is remembered; else the answer is 404."""
     job = queue.get(job_id)
     if job is None:
         from werkzeug.exceptions import NotFound
@@ -173,7 +111,7 @@ def _found(queue: JobQueue, job_id: str) -> Job:
     return job
 
 
-def _wait(job: Job, waiters: threading.BoundedSemaphore) -> None:
+def wait_for(job: Job, waiters: threading.BoundedSemaphore) -> None:
     """Wait for the job as long as ``?wait=SECONDS`` asks, if a thread can be spared."""
     text = request.args.get("wait", "0")
     try:
@@ -189,7 +127,8 @@ def _wait(job: Job, waiters: threading.BoundedSemaphore) -> None:
             waiters.release()
 
 
-def _shown(job: Job, queue: JobQueue) -> dict[str, Any]:
+def shown(job: Job, queue: JobQueue) -> dict[str, Any]:
+    """Return what a client may know of a job, as JSON values."""
     return {
         "id": job.id,
         "state": job.state,
@@ -296,39 +235,5 @@ def _strict(data: bytes, what: str) -> Any:
     """JSON without NaN or repeated keys."""
     try:
         return read_json(text_of(data), _MOST_FIELDS)
-    except (ValueError, GeometryError) as error:
-        raise UsageError(f"{what} is not JSON ({error})") from None
-
-
-def listen(app: Flask, port: int) -> Any:
-    """Bind the loopback interface.
-
-    Parameters
-    ----------
-    port : 0 takes a free one; ``server.effective_port`` tells which
-
-    Returns
-    -------
-    waitress server; ``run()`` serves until interrupted, ``close()`` frees the port
-
-    Raises
-    ------
-    UsageError
-        The port is taken.
-    """
-    try:
-        return create_server(
-            app,
-            host=LOOPBACK,
-            port=port,
-            threads=THREADS,
-            ident="gcar",
-            max_request_body_size=app.config["MAX_CONTENT_LENGTH"],
-            max_request_header_size=32 * 2**10,
-            channel_timeout=30,
-            cleanup_interval=5,
-            connection_limit=64,
-            clear_untrusted_proxy_headers=True,
-        )
-    except OSError as error:
-        raise UsageError(f"port {port} cannot be used ({error.strerror})") from None
+    except (ValueError, GeometryError) as problem:
+        raise UsageError(f"{what} is not JSON ({problem})") from None

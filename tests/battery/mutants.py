@@ -192,7 +192,7 @@ MUTANTS = (
     ),
     Mutant(
         "worker: any token opens",
-        "gcar_deploy/worker/http.py",
+        "gcar_deploy/worker/loopback.py",
         "not hmac.compare_digest(given, expected)",
         "not given and expected",
         ("tests/worker/test_http.py",),

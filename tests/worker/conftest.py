@@ -109,7 +109,8 @@ def serving(make_queue, good_case, tmp_path):  # noqa: F811 - the imported fixtu
     """Client of a worker whose folder holds the good case."""
     pytest.importorskip("flask")
     pytest.importorskip("waitress")
-    from gcar_deploy.worker.http import create_app, listen
+    from gcar_deploy.worker.http import create_app
+    from gcar_deploy.worker.loopback import listen
 
     folder = tmp_path / "folder"
     folder.mkdir()
