@@ -16,6 +16,7 @@ import click
 #: verb -> (module, what ``gcar --help`` says of it); kept here so that help imports nothing.
 VERBS = {
     "run": ("gcar_deploy.cli.run", "Reconstruct a coronary tree from two or more pictures."),
+    "open": ("gcar_deploy.cli.open", "See, correct and run a case in the browser."),
     "validate": ("gcar_deploy.cli.validate", "Check pictures and geometry; reconstruct nothing."),
     "geometry": ("gcar_deploy.cli.geometry", "Read or show where the views were taken from."),
     "enhance": ("gcar_deploy.cli.enhance", "Show the steps of finding vessels in one picture."),
@@ -27,6 +28,8 @@ VERBS = {
     "doctor": ("gcar_deploy.cli.doctor", "Check this installation."),
     "info": ("gcar_deploy.cli.info", "Print what a result folder or a model is."),
 }
+#: verbs whose function has another name: a builtin's is not taken
+_FUNCTIONS = {"open": "open_"}
 INTERRUPTED, TERMINATED, INTERNAL = 130, 143, 1
 
 
@@ -46,7 +49,9 @@ class LazyGroup(click.Group):
         if cmd_name not in VERBS:
             return None
         module, _ = VERBS[cmd_name]
-        command: click.Command = getattr(importlib.import_module(module), cmd_name)
+        command: click.Command = getattr(
+            importlib.import_module(module), _FUNCTIONS.get(cmd_name, cmd_name)
+        )
         return command
 
     def resolve_command(

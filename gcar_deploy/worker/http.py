@@ -10,11 +10,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from flask import Flask, Response, jsonify, request, send_from_directory, url_for
+from flask import Flask, Response, request, send_from_directory, url_for
 from werkzeug.datastructures import FileStorage
 
 from gcar_deploy import __version__
-from gcar_deploy.errors import GcarError, GeometryError, UsageError
+from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.files import text_of
 from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.inputs.order import MOST_VIEWS, parse_order

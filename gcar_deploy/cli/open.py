@@ -1,0 +1,88 @@
+"""gcar open: the workbench in the browser."""
+
+from __future__ import annotations
+
+import functools
+import secrets
+import threading
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, needs_extra, talk_options
+from gcar_deploy.cli.request import METHOD, READING, order_options
+from gcar_deploy.inputs.order import Order, check_views
+
+_FOLDER = Path("gcar-cases")
+
+
+@click.command("open")
+@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="[VIEW ... | CASE]")
+@order_options("out", *METHOD, *READING, "file")
+@click.option("--no-browser", is_flag=True, help="Print the address; open nothing.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Of 127.0.0.1; 0 takes a free one."
+)
+@engine_options
+@talk_options("verbose")
+def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk: Talk) -> None:
+    """See a case in the browser, correct it, run it again.
+
+    Without an argument there is a start page: the demo in one click, or drop files. With pictures
+    or DICOM runs the case is opened; with the folder of an earlier case that one. Each case has a
+    folder below --out (gcar-cases by default) with order.json, which holds every correction, and
+    the result: gcar run --order CASE/order.json makes the same files again.
+
+    The server listens on 127.0.0.1 alone and answers who bears its token, a part of the address.
+    Ctrl-C ends it.
+
+    \b
+    Example:
+      gcar open
+      gcar open view1.png view2.png --geom geom.json
+      gcar open gcar-cases/demo
+    """  # noqa: D301 - click wants a real backspace
+    talk.set_up()
+    engine.limit_threads()
+    with needs_extra("serve", "flask", "waitress", "werkzeug"):
+        from gcar_deploy.workbench.http import create_app
+    from gcar_deploy.worker.jobs import JobQueue
+    from gcar_deploy.worker.loopback import LOOPBACK, listen
+    from gcar_deploy.workbench.desk import Desk
+
+    desk = Desk((order.out or _FOLDER).absolute())
+    first = _first(desk, order)
+    warm = engine.engine(Order())
+    # While the start page is read, the first of everything is loaded.
+    threading.Thread(target=warm.warmup, name="gcar-warmup", daemon=True).start()
+    queue = JobQueue(functools.partial(desk.work, warm))
+    try:
+        token = secrets.token_urlsafe(32)
+        server = listen(create_app(desk, queue, token, first), port)
+        address = f"http://{LOOPBACK}:{server.effective_port}/#{token}"
+        click.echo(address)
+        if not no_browser:
+            webbrowser.open(address)
+        try:
+            server.run()
+        except KeyboardInterrupt:
+            click.echo("gcar: stopping", err=True)
+        finally:
+            server.close()
+    finally:
+        queue.close()
+
+
+def _first(desk: Any, order: Order) -> str | None:
+    """Put on the desk what the command names; return its name."""
+    from gcar_deploy.workbench.desk import absolute
+
+    views = order.views
+    if not views:
+        return None
+    if len(views) == 1 and views[0].is_dir():
+        return str(desk.again(views[0]).id)
+    check_views(order)
+    return str(desk.add(desk.new_folder("case"), absolute(order)).id)

@@ -1,0 +1,189 @@
+"""One case on the desk: its order, its pictures, and what the last run made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import secrets
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.dicom.frames import Frames
+from gcar_deploy.dicom.header import is_dicom, read_header
+from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.files import read_text
+from gcar_deploy.geometry.fields import read_json
+from gcar_deploy.geometry.frame import OwnFrame
+from gcar_deploy.geometry.scene import Scene, View, scene_to_json
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.vessels import Vessels
+from gcar_deploy.inputs.order import Order, order_to_json, parse_order
+from gcar_deploy.inputs.pictures import prepare
+from gcar_deploy.result import Result
+from gcar_deploy.steps import Step
+
+ORDER_NAME = "order.json"
+RESULT_NAME = "result"
+#: what the page may change of an order
+CORRECTIONS = (
+    "edits", "regions", "landmarks", "ostia", "deleted_mm", "frames", "geometry", "pose",
+    "segmenter", "predictor", "refiner",
+)  # fmt: skip
+
+
+class Case:
+    """One case; its order is kept in its folder after every change.
+
+    Parameters
+    ----------
+    folder : existing folder of the case, for ``order.json`` and ``result``
+    order : Order; files in the folder by their names, others by full paths
+
+    Attributes
+    ----------
+    id : name of the folder
+    key : unguessable, part of the address of the result's files
+    order : Order
+    result : of the last run that ended well, None before
+    job_id : of the last run, None before
+    """
+
+    def __init__(self, folder: Path, order: Order) -> None:
+        self.folder, self.id = folder, folder.name
+        self.key = secrets.token_urlsafe(16)
+        self.result: Result | None = None
+        self.job_id: str | None = None
+        self._steps: list[Step] = []
+        self._lock = threading.Lock()
+        self.order = dataclasses.replace(order, out=Path(RESULT_NAME), force=True)
+        self._keep()
+
+    @property
+    def order_file(self) -> Path:
+        """Where the order is kept: ``gcar run --order`` repeats the result."""
+        return self.folder / ORDER_NAME
+
+    @property
+    def ready_order(self) -> Order:
+        """The order with full paths."""
+        return self.order.relative_to(self.folder)
+
+    def correct(self, values: Mapping[str, Any]) -> None:
+        """Replace the corrections that are given; null or nothing takes them back.
+
+        Raises
+        ------
+        UsageError
+            A key is no correction, or its value is wrong: nothing is changed then.
+        """
+        for key in values:
+            if key not in CORRECTIONS:
+                raise UsageError(f"key {key[:40]!r} is none of {', '.join(CORRECTIONS)}")
+        with self._lock:
+            told = {**self.order.to_dict(), **values}
+            self.order = parse_order({k: v for k, v in told.items() if v not in (None, [], {})})
+            self._keep()
+
+    def take_step(self, step: Step) -> None:
+        """Remember what a run hands on, so that a refused one can be looked at as well."""
+        if isinstance(step, OwnFrame):
+            self._steps = [step]
+        elif isinstance(step, Vessels):
+            self._steps.append(step)
+
+    @property
+    def vessels(self) -> tuple[VesselImage, ...]:
+        """Vessels that the last run found, in the order of the views; empty before."""
+        if len(self._steps) < 2:
+            return ()
+        frame, found = self._steps[:2]
+        if not (isinstance(frame, OwnFrame) and isinstance(found, Vessels)):
+            return ()
+        return tuple(found.views[frame.place(k)] for k in range(len(found.views)))
+
+    def angiograms(self) -> tuple[Angiogram, ...]:
+        """Pictures with their geometry as it is told, without what was drawn in them.
+
+        Raises
+        ------
+        GcarError
+            They cannot be read or do not go together.
+        """
+        return self._prepared()[0]
+
+    def described(self) -> dict[str, Any]:
+        """Return all that the page shows before a run, as JSON values; a problem is a sentence."""
+        out: dict[str, Any] = {
+            "id": self.id, "key": self.key, "order": self.order.to_dict(),
+            "order_file": str(self.order_file), "names": [p.name for p in self.order.views],
+            "views": [], "notes": [], "geometry": None, "problem": None,
+            "job": self.job_id, "result": self.result is not None,
+            "dicom": [is_dicom(path) for path in self.ready_order.views],
+        }  # fmt: skip
+        try:
+            angiograms, notes = self._prepared()
+            out["geometry"] = self._geometry(angiograms)
+        except GcarError as error:
+            out["problem"] = str(error)
+            return out
+        out["notes"] = notes
+        out["views"] = [
+            {
+                "id": a.view_id, "name": a.carm.clinical_name(), "rows": a.carm.rows,
+                "columns": a.carm.columns, "kind": a.intensity.kind,
+                "pixel_mm": a.carm.pixel_at_isocenter_mm,
+            }
+            for a in angiograms
+        ]  # fmt: skip
+        return out
+
+    def run_of(self, number: int) -> Frames:
+        """Return the frames of view ``number`` (from 1).
+
+        Raises
+        ------
+        UsageError
+            There is no such view, or it is no DICOM run.
+        """
+        views = self.ready_order.views
+        if not 1 <= number <= len(views) or not is_dicom(views[number - 1]):
+            raise UsageError(f"view {number} is no DICOM run")
+        return _frames(views[number - 1])
+
+    def _prepared(self) -> tuple[tuple[Angiogram, ...], list[str]]:
+        order = self.ready_order
+        # Only what tells how the pictures are read: drawing must not read them again.
+        what = json.dumps({k: v for k, v in order.to_dict().items() if k in _READING})
+        if getattr(self, "_read", (None,))[0] != what:
+            found, _, notes = prepare(
+                order.views, order.geometry, order.options(RunOptions()), order.masks
+            )
+            self._read = what, (tuple(found), notes)
+        return self._read[1]
+
+    def _geometry(self, angiograms: tuple[Angiogram, ...]) -> Any:
+        told = self.ready_order.geometry
+        if isinstance(told, Mapping):
+            return told
+        if isinstance(told, Path):
+            return read_json(read_text(told, 64 * 1024))
+        views = tuple(View(id=a.view_id, carm=a.carm, intensity=a.intensity) for a in angiograms)
+        return json.loads(scene_to_json(Scene(views=views)))
+
+    def _keep(self) -> None:
+        new = self.folder / (ORDER_NAME + ".new")
+        new.write_text(order_to_json(self.order), encoding="utf-8")
+        new.replace(self.order_file)
+
+
+#: keys of an order that tell how its pictures are read
+_READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm")
+
+
+@functools.lru_cache(maxsize=8)
+def _frames(path: Path) -> Frames:
+    return Frames(read_header(path, RunOptions().dicom.limits))

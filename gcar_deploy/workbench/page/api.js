@@ -1,0 +1,44 @@
+// The way to the server: every call bears the token, which came behind the # of the address.
+const KEY = "gcar-token";
+const given = location.hash.slice(1);
+if (given) {
+  sessionStorage.setItem(KEY, given);
+  history.replaceState(null, "", location.pathname);
+}
+const token = sessionStorage.getItem(KEY) || "";
+
+async function answer(method, path, body) {
+  const headers = { Authorization: `Bearer ${token}` };
+  let content = body;
+  if (body !== undefined && !(body instanceof FormData)) {
+    headers["Content-Type"] = "application/json";
+    content = JSON.stringify(body);
+  }
+  const found = await fetch(path, { method, headers, body: content });
+  if (!found.ok) {
+    let text = `${found.status} ${found.statusText}`;
+    try { text = (await found.json()).error.message; } catch { /* no JSON: the status says it */ }
+    if (found.status === 401) text = "This page has no token: open the address that gcar open printed.";
+    throw new Error(text);
+  }
+  return found;
+}
+
+export const get = async path => (await answer("GET", path)).json();
+export const post = async (path, body) => (await answer("POST", path, body)).json();
+export const put = async (path, body) => (await answer("PUT", path, body)).json();
+export const remove = async path => (await answer("DELETE", path)).json();
+export const image = async path => createImageBitmap(await (await answer("GET", path)).blob());
+export const imageUrl = async path => URL.createObjectURL(await (await answer("GET", path)).blob());
+
+/** Follow a job to its end; tell is called with each state of it. */
+export async function follow(job, tell) {
+  let now = job;
+  tell(now);
+  while (now.state === "queued" || now.state === "running") {
+    await new Promise(resolve => setTimeout(resolve, 120));
+    now = await get(`/api/jobs/${now.id}`);
+    tell(now);
+  }
+  return now;
+}

@@ -1,0 +1,60 @@
+// Small helpers for elements and canvases.
+export const $ = id => document.getElementById(id);
+
+/** Make an element: attributes and listeners (on...) from an object, then children. */
+export function el(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (key === "class") made.className = value;
+    else if (value === true) made.setAttribute(key, "");
+    else if (value !== false && value !== null && value !== undefined) made.setAttribute(key, value);
+  }
+  made.append(...children.flat().filter(child => child !== null && child !== undefined));
+  return made;
+}
+
+/** Context of a canvas in CSS pixels, sharp on any screen, with its width and height. */
+export function pen(canvas) {
+  const ratio = window.devicePixelRatio || 1;
+  const width = canvas.clientWidth, height = canvas.clientHeight;
+  const wide = Math.round(width * ratio), high = Math.round(height * ratio);
+  if (canvas.width !== wide || canvas.height !== high) { canvas.width = wide; canvas.height = high; }
+  const ctx = canvas.getContext("2d");
+  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+  ctx.clearRect(0, 0, width, height);
+  ctx.lineCap = ctx.lineJoin = "round";
+  return [ctx, width, height];
+}
+
+export function inside(event, target) {
+  const box = target.getBoundingClientRect();
+  return [event.clientX - box.left, event.clientY - box.top];
+}
+
+/** Text that is readable on any picture. */
+export function label(ctx, text, x, y, color = "#fff", size = 13) {
+  ctx.font = `600 ${size}px system-ui, sans-serif`;
+  ctx.lineWidth = 3.5; ctx.strokeStyle = "#000"; ctx.strokeText(text, x, y);
+  ctx.fillStyle = color; ctx.fillText(text, x, y);
+}
+
+export function ring(ctx, x, y, radius, color, dark = "#000") {
+  for (const [wide, ink] of [[5, dark], [2.2, color]]) {
+    ctx.lineWidth = wide; ctx.strokeStyle = ink;
+    ctx.beginPath(); ctx.arc(x, y, radius, 0, 2 * Math.PI); ctx.stroke();
+  }
+}
+
+// Okabe and Ito's colours, apart for all kinds of colour vision; the darkest made lighter.
+const COLORS = ["#e69f00", "#56b4e9", "#00b386", "#f0e442", "#cc79a7", "#ff7a33", "#8fb8ff", "#ffffff"];
+export const colorOf = branch => COLORS[(branch - 1) % COLORS.length];
+
+/** Name of a branch: its number, and its vessel where anatomy tells it. */
+export const nameOf = branch => branch.name ? `${branch.branch} ${branch.name}` : String(branch.branch);
+
+/** Clinical name of a direction. */
+export function direction(primary, secondary) {
+  const a = Math.round(primary), b = Math.round(secondary);
+  return `${a < 0 ? "RAO" : "LAO"} ${Math.abs(a)}\u00b0 ${b < 0 ? "CAU" : "CRA"} ${Math.abs(b)}\u00b0`;
+}

@@ -1,0 +1,46 @@
+// Frames of DICOM runs with what speaks for each: contrast and stillness.
+import * as api from "./api.js";
+import { $, el } from "./dom.js";
+
+export async function frames(store, say) {
+  const { dicom, views } = store.info;
+  const runs = dicom.map((is, k) => is ? k : -1).filter(k => k >= 0);
+  $("frames").hidden = !runs.length || !views.length;
+  if ($("frames").hidden) return;
+  const room = $("frames").querySelector("div");
+  try {
+    const strips = await Promise.all(runs.map(k => strip(store, say, k)));
+    room.replaceChildren(...strips);
+  } catch (error) { say(error.message); }
+}
+
+async function strip(store, say, k) {
+  const path = `${store.path}/views/${k + 1}/frames`, told = await api.get(path);
+  const order = store.info.order.frames;
+  const asked = order && (order.length === 1 ? order[0] : order[k]);
+  const now = asked ?? told.chosen;
+  const near = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(async one => {
+    near.unobserve(one.target);
+    one.target.src = await api.imageUrl(`${path}/${one.target.dataset.frame}.png`);
+  }), { rootMargin: "200px" });
+  const buttons = told.filling.map((filling, i) => {
+    const picture = el("img", { alt: "", "data-frame": i + 1 });
+    near.observe(picture);
+    const meter = el("span", { class: "meter" }, el("span", {}));
+    meter.firstChild.style.width = `${Math.round(100 * filling)}%`;
+    return el("button", { type: "button", "aria-pressed": String(i + 1 === now),
+      title: `Contrast ${Math.round(100 * filling)} %, motion ${Math.round(100 * told.motion[i])} % of the most`,
+      onclick: () => choose(store, say, k, i + 1) }, picture, meter, `${i + 1}${i + 1 === told.chosen ? " \u2605" : ""}`);
+  });
+  return el("div", {}, el("p", { class: "hint" }, `View ${k + 1}: frame ${now} of ${told.frames}${asked ? " (yours)" : ` (${told.reason})`}. Bar: contrast. \u2605: proposed.`),
+    el("div", { class: "strip", tabindex: 0, role: "group", "aria-label": `Frames of view ${k + 1}` }, ...buttons));
+}
+
+async function choose(store, say, k, frame) {
+  const runs = store.info.dicom.filter(is => is).length;
+  const place = store.info.dicom.slice(0, k).filter(is => is).length;
+  const before = store.info.order.frames ?? [null];
+  const all = before.length === 1 ? Array(runs).fill(before[0]) : [...before];
+  all[place] = frame;
+  try { await store.change({ frames: all }); } catch (error) { say(error.message); }
+}

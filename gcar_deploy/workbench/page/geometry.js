@@ -1,0 +1,71 @@
+// Where each view was taken from: a drawing of the C-arm, and its numbers to be edited.
+import { $, direction, el } from "./dom.js";
+
+const FIELDS = [
+  ["primary_angle_deg", "RAO \u2212 / LAO +", "\u00b0", -180, 180],
+  ["secondary_angle_deg", "Caudal \u2212 / cranial +", "\u00b0", -90, 90],
+  ["detector_rotation_deg", "Detector turned", "\u00b0", -360, 360],
+  ["sod_mm", "Source to isocentre", "mm", 300, 5000],
+  ["sdd_mm", "Source to detector", "mm", 300, 8000],
+  ["pixel_spacing_mm", "Pixel at the detector", "mm", 0.02, 10],
+];
+
+/** Show one card a view; what is edited becomes part of the order. */
+export function geometry(store, say) {
+  const cards = $("geometry").querySelector(".cards");
+  const told = store.info.geometry;
+  if (!told) { cards.replaceChildren(el("p", {}, store.info.problem ?? "Not known.")); return; }
+  cards.replaceChildren(...told.views.map((view, k) => card(store, say, view, k)));
+}
+
+function card(store, say, view, k) {
+  const numbers = FIELDS.flatMap(([key, name, unit, least, most]) => {
+    const value = key === "pixel_spacing_mm" ? view[key][0] : view[key] ?? 0;
+    const input = el("input", { type: "number", id: `${key}-${k}`, min: least, max: most, step: "any", value,
+      onchange: e => edit(store, say, k, key, e.target) });
+    return [el("label", { for: `${key}-${k}` }, name), input, el("span", {}, unit)];
+  });
+  return el("div", { class: "carm" }, el("h3", {}, `View ${view.id}: ${direction(view.primary_angle_deg, view.secondary_angle_deg)}`),
+    drawing(view), el("div", { class: "numbers" }, ...numbers));
+}
+
+async function edit(store, say, k, key, input) {
+  const value = Number(input.value);
+  if (!input.checkValidity() || input.value === "") { say(`View ${k + 1}: ${key} must be ${input.min} .. ${input.max}`); return; }
+  const told = structuredClone(store.info.geometry);
+  told.views[k][key] = key === "pixel_spacing_mm" ? [value, value] : value;
+  try { await store.change({ geometry: told }); } catch (error) { say(error.message); }
+}
+
+const NS = "http://www.w3.org/2000/svg";
+function svg(name, attributes, ...children) {
+  const made = document.createElementNS(NS, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+const at = (degrees, radius) => [radius * Math.sin(degrees * Math.PI / 180), -radius * Math.cos(degrees * Math.PI / 180)];
+
+/** A beam through the patient: source below, detector above, as at zero degrees. */
+function dial(degrees, y, words, body) {
+  const [dx, dy] = at(degrees, 44), [sx, sy] = at(degrees + 180, 50);
+  const turned = `rotate(${degrees})`;
+  return svg("g", { transform: `translate(66 ${y})` },
+    svg("circle", { r: 50, fill: "none", stroke: "#cfd6e0" }), body,
+    svg("path", { d: `M ${sx} ${sy} L ${dx} ${dy}`, stroke: "#0b5cad", "stroke-width": 2 }),
+    svg("rect", { x: -18, y: -48, width: 36, height: 9, rx: 2, fill: "#1a2230", transform: turned }),
+    svg("circle", { cx: sx, cy: sy, r: 6, fill: "#e69f00", stroke: "#1a2230" }),
+    ...words.map(([text, x, ty]) => { const t = svg("text", { x, y: ty, "font-size": 10, "text-anchor": "middle", fill: "#525c6b" }); t.textContent = text; return t; }));
+}
+
+function drawing(view) {
+  // Seen from the feet: the patient's left is on the right of the drawing.
+  const axial = dial(view.primary_angle_deg, 64, [["RAO", -52, -40], ["LAO", 52, -40]],
+    svg("ellipse", { rx: 26, ry: 17, fill: "#f3d9c4", stroke: "#b08c70" }));
+  // Seen from the patient's left: the head is on the right.
+  const sagittal = dial(view.secondary_angle_deg, 200, [["CAU", -52, -40], ["CRA", 52, -40]],
+    svg("g", {}, svg("rect", { x: -34, y: -12, width: 52, height: 24, rx: 10, fill: "#f3d9c4", stroke: "#b08c70" }),
+      svg("circle", { cx: 27, r: 10, fill: "#f3d9c4", stroke: "#b08c70" })));
+  const name = `C-arm at ${direction(view.primary_angle_deg, view.secondary_angle_deg)}, from the feet and from the left`;
+  return svg("svg", { viewBox: "0 0 132 264", role: "img", "aria-label": name }, axial, sagittal);
+}

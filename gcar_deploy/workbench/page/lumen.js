@@ -1,0 +1,134 @@
+// The table of narrowings, and the diameter along a vessel from the ostium to its tip.
+import { $, colorOf, el, inside, nameOf, pen, ring } from "./dom.js";
+
+const fixed = (value, digits) => value === null || value === undefined ? "\u2013" : value.toFixed(digits);
+const COLUMNS = [
+  ["Vessel", ""], ["Stenosis", "% diameter"], ["", "% area"], ["Least", "mm"], ["Reference", "mm"],
+  ["Lesion", "mm"], ["From ostium", "mm"], ["Length", "mm"], ["\u00b1", "mm"], ["", ""],
+];
+export const area = percent => percent === null ? null : 100 * (1 - (1 - percent / 100) ** 2);
+
+/** Fill the table, the most severe narrowing first; erase is called with a branch to delete. */
+export function table(store, erase) {
+  const branches = [...store.result.scene.branches].sort((a, b) => (b.stenosis ?? -1) - (a.stenosis ?? -1) || a.branch - b.branch);
+  const rows = branches.map(branch => {
+    const { row } = branch, percent = row.stenosis_percent;
+    const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
+      fixed(row.minimal_diameter_mm, 2), fixed(row.reference_diameter_mm, 2), fixed(row.lesion_length_mm, 1),
+      row.minimal_at_mm === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0), fixed(row.mean_sigma_mm, 2)];
+    const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch));
+    jump.querySelector(".swatch").style.background = colorOf(branch.branch);
+    const drop = el("button", { type: "button", class: "small", "aria-label": `Delete branch ${branch.branch}`, title: "Delete this branch (Delete)", onclick: e => { e.stopPropagation(); erase(branch); } }, "Delete");
+    return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : "", onclick: () => jumpTo(store, branch) },
+      el("td", {}, jump), ...cells.map(text => el("td", {}, text)), el("td", {}, drop));
+  });
+  $("lesions").replaceChildren(
+    el("thead", {}, el("tr", {}, ...COLUMNS.map(([name, unit], k) => el("th", { scope: "col" }, name || (k === 9 ? el("span", { class: "swatch", hidden: true }) : "\u00a0"), el("small", {}, unit))))),
+    el("tbody", {}, ...rows));
+  $("lesion-note").textContent = "Bold: narrower by half or more. Reference: healthy diameter at the narrowing, by a line through the wider parts. \u00b1: uncertainty of the centreline's place (one standard deviation).";
+}
+
+/** Choose a branch and mark its narrowing in every drawing. */
+export function jumpTo(store, branch) {
+  store.choose(branch.branch);
+  if (branch.least) store.point({ branch: branch.branch, at: nearest(branch.arc, branch.least[0]) });
+}
+const nearest = (list, value) => list.reduce((best, x, i) => Math.abs(x - value) < Math.abs(list[best] - value) ? i : best, 0);
+
+export class Curve {
+  constructor(store) {
+    this.store = store; this.way = null;
+    const canvas = this.canvas = $("curve");
+    const point = e => { const place = this.nearestTo(inside(e, canvas)[0]); if (place) store.point(place); };
+    canvas.addEventListener("pointermove", point);
+    canvas.addEventListener("pointerdown", point);
+    canvas.addEventListener("keydown", e => {
+      const step = { ArrowLeft: -1, ArrowRight: 1, PageUp: -10, PageDown: 10 }[e.key];
+      if (!step || !this.parts) return;
+      e.preventDefault();
+      const all = this.parts.flatMap(part => part.branch.arc.map((_, at) => ({ branch: part.branch.branch, at })));
+      const now = store.cursor ? all.findIndex(p => p.branch === store.cursor.branch && p.at === store.cursor.at) : 0;
+      store.point(all[Math.max(0, Math.min(all.length - 1, now + step))]);
+    });
+    $("way").addEventListener("change", () => { this.way = Number($("way").value); this.draw(); });
+  }
+  /** Take a new result: every way from an ostium to a tip. */
+  take() {
+    const { ways } = this.store.result;
+    $("way").replaceChildren(...ways.map((way, k) => {
+      const names = [...new Set(way.map(n => this.store.branch(n).name).filter(n => n))].join(" \u2013 ");
+      return el("option", { value: k }, `to branch ${way.at(-1)}${names ? ` (${names})` : ""}`);
+    }));
+    this.follow();
+  }
+  /** Show a way that the chosen branch is part of. */
+  follow() {
+    const ways = this.store.result?.ways ?? [];
+    if (!ways[this.way]?.includes(this.store.chosen)) this.way = Math.max(0, ways.findIndex(way => way.includes(this.store.chosen)));
+    $("way").value = String(this.way);
+    this.draw();
+  }
+  nearestTo(x) {
+    const s = this.frame?.s(x);
+    const part = this.parts?.findLast(one => one.start <= s + 1e-9) ?? this.parts?.[0];
+    return part ? { branch: part.branch.branch, at: nearest(part.branch.arc, s - part.start) } : null;
+  }
+  draw() {
+    const [ctx, width, height] = pen(this.canvas), way = this.store.result?.ways[this.way];
+    if (!way) { this.parts = null; return; }
+    const parts = this.parts = way.map(number => { const branch = this.store.branch(number); return { branch, start: branch.from_ostium }; });
+    const last = parts.at(-1), length = last.start + last.branch.arc.at(-1);
+    const widest = Math.max(...parts.flatMap(p => [...p.branch.radius, ...p.branch.reference.map(r => r ?? 0)]));
+    const most = Math.max(1, Math.ceil(2 * widest)), left = 34, right = width - 8, top = 18, bottom = height - 32;
+    const x = s => left + (right - left) * s / length, y = w => bottom - (bottom - top) * w / most;
+    this.frame = { s: px => (px - left) / (right - left) * length };
+    this.axes(ctx, { left, right, top, bottom, most, length, x, y });
+    for (const { branch, start } of parts) {
+      if (branch.stenosis >= 25) this.lesion(ctx, branch, s => x(start + s), top, bottom);
+      ctx.strokeStyle = "#525c6b"; ctx.lineWidth = 1.5; ctx.setLineDash([5, 4]); ctx.beginPath();
+      let down = false;
+      branch.arc.forEach((s, i) => { const r = branch.reference[i]; if (r !== null) { ctx[down ? "lineTo" : "moveTo"](x(start + s), y(2 * r)); down = true; } });
+      ctx.stroke(); ctx.setLineDash([]);
+      ctx.strokeStyle = "#0b5cad"; ctx.lineWidth = branch.branch === this.store.chosen ? 3.2 : 1.8; ctx.beginPath();
+      branch.arc.forEach((s, i) => ctx[i ? "lineTo" : "moveTo"](x(start + s), y(2 * branch.radius[i])));
+      ctx.stroke();
+      if (start > 0) { ctx.strokeStyle = "#cfd6e0"; ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(start), top); ctx.lineTo(x(start), bottom); ctx.stroke(); }
+      ctx.fillStyle = "#1a2230"; ctx.font = "600 12px system-ui, sans-serif"; ctx.textAlign = "center";
+      ctx.fillText(nameOf(branch), x(start + branch.arc.at(-1) / 2), 12);
+      if (branch.least) ring(ctx, x(start + branch.least[0]), y(branch.least[1]), 4, "#d55e00", "#fff");
+    }
+    const { cursor } = this.store, part = cursor && parts.find(p => p.branch.branch === cursor.branch);
+    if (part) {
+      const s = part.start + part.branch.arc[cursor.at];
+      ctx.strokeStyle = "#8a6d00"; ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(s), top); ctx.lineTo(x(s), bottom); ctx.stroke();
+      ring(ctx, x(s), y(2 * part.branch.radius[cursor.at]), 5, "#ffe14d", "#1a2230");
+    }
+    $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: least diameter.";
+  }
+  axes(ctx, { left, right, top, bottom, most, length, x, y }) {
+    ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = "#525c6b"; ctx.strokeStyle = "#e3e8ee"; ctx.lineWidth = 1;
+    ctx.textAlign = "right"; ctx.textBaseline = "middle";
+    for (let w = 0; w <= most; w += most > 5 ? 2 : 1) {
+      ctx.beginPath(); ctx.moveTo(left, y(w)); ctx.lineTo(right, y(w)); ctx.stroke(); ctx.fillText(String(w), left - 6, y(w));
+    }
+    ctx.textAlign = "center"; ctx.textBaseline = "top";
+    const stride = [5, 10, 20, 50, 100].find(t => length / t <= 8) || 200;
+    for (let s = 0; s <= length; s += stride) ctx.fillText(String(s), x(s), bottom + 4);
+    ctx.textAlign = "right"; ctx.fillText("mm from the ostium", right, bottom + 18);
+    ctx.textAlign = "left"; ctx.fillText("diameter, mm", 4, bottom + 18); ctx.textBaseline = "alphabetic";
+  }
+  lesion(ctx, branch, x, top, bottom) {
+    const narrow = i => branch.reference[i] !== null && branch.radius[i] < 0.75 * branch.reference[i];
+    let first = nearest(branch.arc, branch.least[0]), last = first;
+    while (first > 0 && narrow(first - 1)) first--;
+    while (last + 1 < branch.arc.length && narrow(last + 1)) last++;
+    ctx.fillStyle = "#d55e0033";
+    ctx.fillRect(x(branch.arc[first]), top, Math.max(3, x(branch.arc[last]) - x(branch.arc[first])), bottom - top);
+  }
+  said({ branch, start }, i) {
+    const reference = branch.reference[i], sigma = branch.sigma[i];
+    return `Branch ${nameOf(branch)}, ${(start + branch.arc[i]).toFixed(1)} mm from the ostium: ${(2 * branch.radius[i]).toFixed(2)} mm` +
+      (reference === null ? "" : `, reference ${(2 * reference).toFixed(2)} mm (${Math.max(0, Math.round(100 * (1 - branch.radius[i] / reference)))} % narrower)`) +
+      (sigma === null ? "." : `, \u00b1 ${sigma.toFixed(2)} mm.`);
+  }
+}

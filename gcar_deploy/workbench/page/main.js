@@ -1,0 +1,149 @@
+// The page: start, the case, and what connects its parts.
+import * as api from "./api.js";
+import { $, el } from "./dom.js";
+import { frames } from "./frames.js";
+import { geometry } from "./geometry.js";
+import { Curve, table } from "./lumen.js";
+import { Picture } from "./picture.js";
+import { corrections, files, status } from "./report.js";
+import { Scene3D } from "./scene3d.js";
+import { Store } from "./store.js";
+import { Toolbox, TOOLS } from "./tools.js";
+
+const store = new Store();
+const look = { found: true, tree: true, lens: false, width: 2 };
+const tools = new Toolbox(store, say);
+const curve = new Curve(store);
+let pictures = [], scene = new Scene3D(store);
+
+function say(text, good = false) {
+  $("message").hidden = !text;
+  $("message").className = good ? "message good" : "message";
+  $("message").textContent = text ?? "";
+}
+/** Do something that may fail; its error becomes a sentence. */
+async function attempt(act) {
+  say("");
+  try { await act(); } catch (error) { say(error.message); }
+}
+
+async function start() {
+  const desk = await api.get("/api/desk");
+  document.querySelectorAll(".use").forEach(p => { p.textContent = desk.use; });
+  if (desk.first) return open(await api.get(`/api/cases/${desk.first}`));
+  home(desk);
+}
+function home(desk) {
+  $("start").hidden = false; $("case").hidden = true; $("case-tools").hidden = true; $("case-name").textContent = "";
+  $("earlier").hidden = !desk.cases.length;
+  $("cases").replaceChildren(...desk.cases.map(id => el("li", {}, el("button", { type: "button",
+    onclick: () => attempt(async () => open(await api.get(`/api/cases/${id}`))) }, id))));
+}
+
+async function open(info, run = true) {
+  $("start").hidden = true; $("case").hidden = false; $("case-tools").hidden = false;
+  $("case-name").textContent = info.id; document.title = `${info.id} \u2013 gcar`;
+  scene = new Scene3D(store);
+  store.open(info);
+  if (info.problem) { say(info.problem); $("geometry").open = true; }
+  else if (run) await store.run();
+}
+async function send(list) {
+  const body = new FormData();
+  for (const file of list) body.append("file", file);
+  await open(await api.post("/api/cases", body));
+}
+
+async function load() {
+  const own = pictures;
+  await Promise.all(own.map(async picture => {
+    picture.image = await api.image(`${store.path}/views/${picture.number}/picture.png`);
+    picture.draw();
+  }));
+}
+async function loadFound() {
+  await Promise.all(pictures.map(async picture => {
+    try { picture.found = await api.image(`${store.path}/views/${picture.number}/found.png`); } catch { picture.found = null; }
+    picture.draw();
+  }));
+}
+function lay() {
+  pictures = store.info.views.map((_, k) => new Picture(store, k + 1, tools, look));
+  tools.pictures = pictures; tools.clear();
+  $("pictures").replaceChildren(...pictures.map(p => p.root), scene.root);
+  $("tools").hidden = !pictures.length;
+  attempt(load);
+  geometry(store, say); frames(store, say);
+}
+function draw() { pictures.forEach(p => p.draw()); scene.draw(); curve.draw(); }
+function mark() {
+  document.querySelectorAll("#lesions tbody tr").forEach(row => row.classList.toggle("chosen", Number(row.dataset.branch) === store.chosen));
+}
+function buttons() {
+  $("undo").disabled = !store.canUndo; $("redo").disabled = !store.canRedo;
+  $("run").classList.toggle("stale", store.stale && !store.running);
+  $("run").hidden = store.running; $("cancel").hidden = !store.running;
+}
+/** Delete a branch: its middle names it in the order, whatever its number will be. */
+const erase = branch => attempt(async () => {
+  await store.change({ deleted_mm: [...store.now.deleted_mm ?? [], branch.middle] });
+  await store.run();
+});
+
+store.addEventListener("opened", () => { lay(); buttons(); status(store); corrections(store, say); $("lumen").hidden = true; $("files-of").hidden = true; });
+store.addEventListener("pictures", lay);
+store.addEventListener("changed", () => {
+  buttons(); corrections(store, say); draw();
+  if (store.info.problem) say(store.info.problem);
+});
+store.addEventListener("progress", () => {
+  buttons();
+  const share = Math.round(100 * (store.job?.share ?? 0));
+  $("progress").hidden = !store.running;
+  $("progress").setAttribute("aria-valuenow", share);
+  $("progress").setAttribute("aria-valuetext", `${store.job?.stage ?? ""} ${share} %`);
+  $("progress").firstElementChild.style.width = `${share}%`;
+  status(store);
+});
+store.addEventListener("finished", () => {
+  const done = store.result !== null;
+  $("lumen").hidden = !done; scene.root.hidden = !done;
+  status(store); buttons(); files(store);
+  if (done) { table(store, erase); scene.take(); curve.take(); mark(); }
+  draw(); loadFound();
+});
+store.addEventListener("chosen", () => { mark(); curve.follow(); pictures.forEach(p => p.draw()); scene.draw(); });
+
+$("demo").addEventListener("click", () => attempt(async () => open(await api.post("/api/demo"))));
+$("files").addEventListener("change", e => attempt(() => send(e.target.files)));
+$("home").addEventListener("click", () => attempt(async () => home(await api.get("/api/desk"))));
+$("run").addEventListener("click", () => attempt(() => store.run()));
+$("cancel").addEventListener("click", () => attempt(() => store.cancel()));
+$("undo").addEventListener("click", () => attempt(() => store.undo()));
+$("redo").addEventListener("click", () => attempt(() => store.redo()));
+for (const [id, key] of [["show-found", "found"], ["show-tree", "tree"], ["show-lens", "lens"]]) {
+  $(id).addEventListener("change", () => { look[key] = $(id).checked; draw(); });
+}
+$("line-width").addEventListener("input", () => { look.width = Number($("line-width").value); draw(); });
+const drop = $("drop");
+window.addEventListener("dragover", e => { e.preventDefault(); drop.classList.add("over"); });
+window.addEventListener("dragleave", () => drop.classList.remove("over"));
+window.addEventListener("drop", e => { e.preventDefault(); drop.classList.remove("over"); if (e.dataTransfer.files.length) attempt(() => send(e.dataTransfer.files)); });
+window.addEventListener("resize", draw);
+window.addEventListener("beforeprint", draw);
+
+window.addEventListener("keydown", e => {
+  if ($("case").hidden || e.target.matches("input, select")) return;
+  const key = e.key.toLowerCase();
+  if ((e.ctrlKey || e.metaKey) && key === "z") { e.preventDefault(); return attempt(() => e.shiftKey ? store.redo() : store.undo()); }
+  if (e.ctrlKey || e.metaKey || e.altKey) return;
+  const tool = TOOLS.find(([, , letter]) => letter.toLowerCase() === key);
+  if (tool) tools.take(tool[0]);
+  else if (key === "r") attempt(() => store.run());
+  else if (key === "escape") tools.take("look");
+  else if (key === "enter" && tools.corners) tools.finish(null);
+  else if (key === "h") { $("show-tree").click(); }
+  else if (key === "delete" && store.branch(store.chosen)) erase(store.branch(store.chosen));
+});
+
+attempt(start);

@@ -1,0 +1,64 @@
+// What is said of a result beside its drawings: status, corrections, files, provenance.
+import { $, el } from "./dom.js";
+
+export function status(store) {
+  const box = $("status"), { job, result } = store;
+  box.hidden = !job || store.running;
+  if (box.hidden) return;
+  const word = result ? result.summary.status : job.state;
+  box.className = `status ${word}`;
+  if (!result) { box.replaceChildren(el("b", {}, word), job.error?.message ?? ""); return; }
+  const { summary } = result, said = [...(summary.findings.length > 1 ? summary.findings : []), ...summary.notes];
+  const facts = [["views apart", `${summary.separation_deg.toFixed(0)}\u00b0`], ["branches", summary.tree.branches.length],
+    ["centreline", `${summary.tree.length_mm.toFixed(0)} mm`], ["time", `${summary.seconds.total.toFixed(1)} s`]];
+  const list = (name, lines) => lines.length ? el("details", {}, el("summary", {}, `${name} (${lines.length})`), el("ul", {}, ...lines.map(text => el("li", {}, text)))) : null;
+  box.replaceChildren(el("b", {}, word), summary.sentence,
+    el("div", { class: "facts" }, ...facts.map(([name, value]) => el("span", {}, `${name} `, el("b", {}, String(value))))),
+    ...[list("Findings and notes", said), list("What no picture can show", summary.silent_errors)].filter(x => x));
+}
+
+/** One line a correction, each of which can be taken back by itself. */
+export function corrections(store, say) {
+  const now = store.now, lines = [];
+  const add = (text, values) => lines.push(el("li", {}, text, el("button", { type: "button", class: "small", "aria-label": `Take back: ${text}`,
+    onclick: () => store.change(values).then(() => values.deleted_mm !== undefined && store.run()).catch(error => say(error.message)) }, "\u00d7")));
+  const without = (list, k) => list.filter((_, i) => i !== k);
+  for (const [view, strokes] of Object.entries(now.edits ?? {})) strokes.forEach((stroke, k) => {
+    const left = without(strokes, k), edits = { ...now.edits, [view]: left };
+    if (!left.length) delete edits[view];
+    add(`View ${view}: ${stroke.do === "erase" ? "erased" : "painted"}`, { edits });
+  });
+  for (const view of Object.keys(now.regions ?? {})) {
+    const { [view]: _, ...regions } = now.regions;
+    add(`View ${view}: region`, { regions });
+  }
+  (now.landmarks ?? []).forEach((_, k) => add(`Landmark L${k + 1}`, { landmarks: without(now.landmarks, k) }));
+  (now.ostia ?? []).forEach((_, k) => add(`Ostium O${k + 1}`, { ostia: without(now.ostia, k) }));
+  (now.deleted_mm ?? []).forEach((place, k) => add(`Branch deleted at (${place.map(x => x.toFixed(0)).join(", ")}) mm`, { deleted_mm: without(now.deleted_mm, k) }));
+  $("corrections").hidden = !lines.length;
+  $("corrections").querySelector("ul").replaceChildren(...lines);
+}
+
+const ABOUT = {
+  "report.html": "report, one page for the record", "result.json": "all figures", "volume.nii.gz": "volume (NIfTI)",
+  "surface.stl": "surface", "surface.glb": "surface for viewers", "centerline.vtp": "centreline (VTK)",
+  "centerline.csv": "centreline (table)", "gaussians.npz": "Gaussians", "gaussians.ply": "Gaussians (3DGS)",
+};
+
+export function files(store) {
+  const room = $("files-of").querySelector("div");
+  $("files-of").hidden = !store.result;
+  if (!store.result) return;
+  const { summary, files: sizes } = store.result, base = `/files/${store.info.key}`;
+  const names = [...new Set([...Object.keys(sizes), "surface.glb"])];
+  const link = name => el("a", { href: `${base}/${name}`, ...(name === "report.html" ? { target: "_blank" } : { download: name }) },
+    `${name}${ABOUT[name] ? ` \u2013 ${ABOUT[name]}` : ""}`);
+  const model = one => one ? `${one.name} (${one.sha256.slice(0, 12)})` : "none";
+  const rows = [["Order", store.info.order_file], ["Repeat", `gcar run --order ${store.info.order_file}`],
+    ["Centres", summary.predictor], ["Model", model(summary.model)], ["Vessel network", model(summary.segmenter)],
+    ["Refinement", `${summary.refiner}, ${summary.counts.steps} steps`],
+    ...summary.views.map(v => [`Picture ${v.id}`, `${v.picture.columns} x ${v.picture.rows}, ${v.picture.bit_depth} bit, ${v.kind}, SHA-256 ${v.picture.sha256.slice(0, 12)}`]),
+    ...Object.entries(summary.versions).map(([name, version]) => [name, version ?? "not installed"])];
+  room.replaceChildren(el("div", { class: "links" }, link("order.json"), ...names.map(link)),
+    el("table", { class: "names" }, el("tbody", {}, ...rows.map(([name, value]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, value))))));
+}

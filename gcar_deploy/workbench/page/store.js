@@ -1,0 +1,93 @@
+// The case on the page: what the server says of it, its corrections with undo, its result.
+import * as api from "./api.js";
+
+// What is undone and redone: keys of the order that the page changes.
+const KEYS = ["edits", "regions", "landmarks", "ostia", "deleted_mm", "frames", "geometry"];
+const corrections = order => Object.fromEntries(KEYS.map(key => [key, order[key] ?? null]));
+const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
+
+export class Store extends EventTarget {
+  info = null; result = null; job = null; running = false;
+  chosen = 0; cursor = null; ran = null; #past = []; #future = [];
+
+  get path() { return `/api/cases/${this.info.id}`; }
+  get now() { return corrections(this.info.order); }
+  get canUndo() { return this.#past.length > 0; }
+  get canRedo() { return this.#future.length > 0; }
+  /** Whether the result was made without the corrections of now. */
+  get stale() { return this.ran !== null && !same(this.ran, this.now); }
+
+  tell(what) { this.dispatchEvent(new Event(what)); }
+
+  open(info) {
+    Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null });
+    this.#past = []; this.#future = [];
+    this.tell("opened");
+  }
+
+  /** Change corrections; what comes of it can be undone. */
+  async change(values) {
+    const before = this.now;
+    await this.#send({ ...before, ...values });
+    this.#past.push(before); this.#future = [];
+    this.tell("changed");
+  }
+
+  async undo() { await this.#step(this.#past, this.#future); }
+  async redo() { await this.#step(this.#future, this.#past); }
+
+  async #step(from, to) {
+    if (!from.length) return;
+    const before = this.now, after = from.at(-1);
+    await this.#send(after);
+    from.pop(); to.push(before);
+    this.tell("changed");
+    // Only a new run shows what becomes of a tree; strokes are seen at once.
+    if (!same(before.deleted_mm, after.deleted_mm) || !same(before.ostia, after.ostia)) await this.run();
+  }
+
+  async #send(values) {
+    const geometry = !same(values.geometry, this.now.geometry), frames = !same(values.frames, this.now.frames);
+    this.info = await api.put(`${this.path}/order`, values);
+    if (geometry || frames) this.tell("pictures");
+  }
+
+  async run() {
+    if (this.running) await this.cancel();
+    const asked = this.now, path = this.path;
+    this.running = true;
+    try {
+      const begun = this.job = await api.post(`${path}/run`);
+      const done = await api.follow(begun, job => {
+        if (this.job?.id === begun.id) { this.job = job; this.tell("progress"); }
+      });
+      if (this.job?.id !== begun.id) return;
+      this.ran = asked;
+      this.result = done.state === "done" ? await api.get(`${path}/result`) : null;
+      if (this.result) {
+        const branches = this.result.scene.branches;
+        this.chosen = branches.some(b => b.branch === this.chosen) ? this.chosen : worst(branches);
+        this.cursor = null;
+      }
+      this.tell("finished");
+    } finally {
+      this.running = false;
+      this.tell("progress");
+    }
+  }
+
+  async cancel() {
+    if (this.job && this.running) await api.remove(`/api/jobs/${this.job.id}`);
+  }
+
+  choose(branch) { this.chosen = branch; this.cursor = null; this.tell("chosen"); }
+  /** A point of a branch that all drawings mark: its number and the place in its list. */
+  point(cursor) { this.cursor = cursor; this.tell("chosen"); }
+  branch(number) { return this.result?.scene.branches.find(b => b.branch === number) ?? null; }
+}
+
+/** The branch to begin with: the one with the most severe narrowing. */
+function worst(branches) {
+  const ranked = [...branches].sort((a, b) => (b.stenosis ?? -1) - (a.stenosis ?? -1));
+  return ranked.length ? ranked[0].branch : 0;
+}
