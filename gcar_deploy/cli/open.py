@@ -48,9 +48,9 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
     engine.limit_threads()
     with needs_extra("serve", "flask", "waitress", "werkzeug"):
         from gcar_deploy.workbench.http import create_app
+    from gcar_deploy.workbench.desk import Desk
     from gcar_deploy.worker.jobs import JobQueue
     from gcar_deploy.worker.loopback import LOOPBACK, listen
-    from gcar_deploy.workbench.desk import Desk
 
     desk = Desk((order.out or _FOLDER).absolute())
     first = _first(desk, order)

@@ -23,10 +23,6 @@ from gcar_deploy.inputs.drawn import parse_point
 from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
 from gcar_deploy.output.glb import glb_bytes
 from gcar_deploy.reconstruction import RESEARCH_USE
-from gcar_deploy.worker.http import found_job, shown, wait_for
-from gcar_deploy.worker.jobs import JobQueue
-from gcar_deploy.worker.loopback import THREADS, error, guard, tell_errors
-from gcar_deploy.worker.orders import Received, suffix_of
 from gcar_deploy.workbench.case import RESULT_NAME, Case
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.workbench.shown import (
@@ -37,6 +33,10 @@ from gcar_deploy.workbench.shown import (
     thumbnail_png,
 )
 from gcar_deploy.workbench.trace import trace
+from gcar_deploy.worker.http import found_job, shown, wait_for
+from gcar_deploy.worker.jobs import JobQueue
+from gcar_deploy.worker.loopback import THREADS, error, guard, tell_errors
+from gcar_deploy.worker.orders import Received, suffix_of
 
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "

@@ -25,7 +25,7 @@ function card(store, say, view, k) {
       onchange: e => edit(store, say, k, key, e.target) });
     return [el("label", { for: `${key}-${k}` }, name), input, el("span", {}, unit)];
   });
-  return el("div", { class: "carm" }, el("h3", {}, `View ${view.id}: ${direction(view.primary_angle_deg, view.secondary_angle_deg)}`),
+  return el("div", { class: "carm" }, el("h3", {}, `View ${view.id ?? k + 1}: ${direction(view.primary_angle_deg, view.secondary_angle_deg)}`),
     drawing(view), el("div", { class: "numbers" }, ...numbers));
 }
 

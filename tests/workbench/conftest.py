@@ -1,0 +1,103 @@
+"""A workbench with a real engine on a free port, and a browser that counts what it asks for."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import shutil
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+
+from gcar_deploy.engine import Engine
+from gcar_deploy.worker.jobs import JobQueue
+
+TOKEN = "a-token-of-the-tests"
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
+#: a busy machine is slow
+PATIENCE_MS = 240_000
+
+
+@pytest.fixture(scope="session")
+def engine():
+    return Engine(threads=1)
+
+
+@pytest.fixture
+def serve(engine, tmp_path):
+    """Call with what to put on the desk (desk -> name or None); returns the address."""
+    pytest.importorskip("flask")
+    pytest.importorskip("waitress")
+    from gcar_deploy.workbench.desk import Desk
+    from gcar_deploy.workbench.http import create_app
+    from gcar_deploy.worker.loopback import listen
+
+    opened = []
+
+    def start(put=lambda desk: None) -> tuple[str, Path]:
+        desk = Desk(tmp_path / "cases")
+        queue = JobQueue(functools.partial(desk.work, engine))
+        server = listen(create_app(desk, queue, TOKEN, put(desk)), 0)
+
+        def run() -> None:
+            with contextlib.suppress(OSError):
+                server.run()
+
+        threading.Thread(target=run, daemon=True).start()
+        opened.append((server, queue))
+        return f"http://127.0.0.1:{server.effective_port}", tmp_path / "cases"
+
+    yield start
+    for server, queue in opened:
+        port = int(server.effective_port)
+        server.close()
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+            pass
+        queue.close()
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    playwright = pytest.importorskip("playwright.sync_api")
+    if BROWSER is None:
+        pytest.skip("no Chromium")
+    with playwright.sync_playwright() as driver:
+        found = driver.chromium.launch(
+            executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"], timeout=PATIENCE_MS
+        )
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def browse(chromium):
+    """Call with an address and a width; at the end the console must be silent, no call foreign."""
+    complaints, contexts = [], []
+
+    def open_page(address: str, width: int = 1280, height: int = 900):
+        context = chromium.new_context(
+            viewport={"width": width, "height": height}, accept_downloads=True
+        )
+        context.set_default_timeout(PATIENCE_MS)
+        contexts.append(context)
+        page = context.new_page()
+        own = (address, "blob:", "data:")
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda r: r.url.startswith(own) or complaints.append(r.url))
+        page.goto(f"{address}/#{TOKEN}")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def finished(page) -> str:
+    """Wait until no run is under way; return the status word."""
+    page.locator("#cancel").wait_for(state="hidden")
+    page.locator("#status").wait_for()
+    return page.inner_text("#status b >> nth=0").lower()

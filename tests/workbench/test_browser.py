@@ -1,0 +1,206 @@
+"""The whole way in a real browser: see, correct, run again, and the order that repeats it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcar_deploy.engine import deliver
+from gcar_deploy.inputs.order import Order, load_order
+from tests.conftest import data_dir
+from tests.workbench.conftest import finished
+
+AXE = Path(__file__).parent / "vendor" / "axe.min.js"
+#: what a run writes that holds no clock
+TIMELESS = ("volume.nii.gz", "centerline.csv", "centerline.vtp", "surface.stl", "gaussians.npz")
+
+
+def order_of(folder: Path) -> dict:
+    return json.loads((folder / "order.json").read_text())
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in TIMELESS}
+
+
+def repeated(engine, case: Path, out: Path) -> dict[str, bytes]:
+    """What the stored order gives, as ``gcar run --order`` reads it."""
+    order = dataclasses.replace(load_order(case / "order.json"), out=out)
+    deliver(engine.reconstruct_order(order), order)
+    return files_of(out)
+
+
+def on_screen(page, view: int, place):
+    """CSS place of a pixel of a view's picture, which is shown whole and square."""
+    canvas = page.locator(".view canvas").nth(view - 1)
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    unit = box["width"] / 512
+    return box["x"] + (place[0] + 0.5) * unit, box["y"] + (place[1] + 0.5) * unit
+
+
+def click(page, view, place):
+    page.mouse.click(*on_screen(page, view, place))
+
+
+def stroke(page, view, places):
+    page.mouse.move(*on_screen(page, view, places[0]))
+    page.mouse.down()
+    for place in places[1:]:
+        page.mouse.move(*on_screen(page, view, place), steps=3)
+    page.mouse.up()
+
+
+def until(page, holds):
+    """Wait; the page's policy forbids Playwright's own way, which evaluates text."""
+    end = time.monotonic() + 240
+    while not holds():
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
+
+
+def until_order(page, case, has):
+    until(page, lambda: has(order_of(case)))
+
+
+def test_demo_to_result_to_deletion_and_back(serve, browse, engine, tmp_path):
+    """One click to a result; a branch deleted, undone and redone; the order repeats the bytes."""
+    address, cases = serve()
+    page = browse(address)
+    page.click("#demo")
+    assert finished(page) == "ok"
+    case = cases / "demo"
+    rows = page.locator("#lesions tbody tr")
+    before, first = rows.count(), files_of(case / "result")
+    assert before > 5 and "deleted_mm" not in order_of(case)
+    page.click('button[aria-label="Delete branch 5"]')
+    until(page, lambda: rows.count() < before)
+    finished(page)
+    assert len(order_of(case)["deleted_mm"]) == 1
+    without = files_of(case / "result")
+    assert without != first
+    page.keyboard.press("Control+z")
+    until(page, lambda: rows.count() == before)
+    finished(page)
+    assert files_of(case / "result") == first and "deleted_mm" not in order_of(case)
+    page.click("#redo")
+    until(page, lambda: rows.count() < before)
+    finished(page)
+    assert files_of(case / "result") == without
+    assert repeated(engine, case, tmp_path / "again") == without
+
+
+def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
+    """Erase, landmark pair on its epipolar line, ostium, region; then run; all in the order."""
+    folder = data_dir() / "cases" / "R_0001"
+    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
+    address, cases = serve(lambda desk: desk.add(desk.new_folder("raw"), given).id)
+    page = browse(address, 1500)
+    case = cases / "raw"
+    finished(page)
+    assert page.locator("#lesions tbody tr").count() > 2
+    page.keyboard.press("e")
+    stroke(page, 1, [(20, 480), (60, 490), (90, 500)])
+    until_order(page, case, lambda o: len(o.get("edits", {}).get("1", ())) == 1)
+    drawn = order_of(case)["edits"]["1"][0]
+    assert drawn["do"] == "erase" and drawn["width_px"] == 14
+    assert np.allclose(drawn["points"][0], (20, 480), atol=1.5)
+
+    from gcar_deploy.geometry.scene import load_scene
+
+    carms = [view.carm for view in load_scene(folder / "geom.json").views]
+    place = np.array([[4.0, -12.0, 8.0]])
+    marks = [carm.project(place)[0][0] for carm in carms]
+    page.keyboard.press("l")
+    click(page, 1, marks[0])
+    page.wait_for_timeout(600)
+    click(page, 2, marks[1])
+    until_order(page, case, lambda o: len(o.get("landmarks", ())) == 1)
+    pair = order_of(case)["landmarks"][0]
+    assert np.allclose(pair[0], marks[0], atol=1.5)
+    # Snapped to a vessel on the line, or where the click was.
+    assert np.linalg.norm(np.array(pair[1]) - marks[1]) < 12
+    page.click("#run")
+    finished(page)
+    assert (
+        "1 strokes of the user erase vessel" in page.inner_text("#status")
+        or page.locator("#status details summary").count()
+    )
+    assert repeated(engine, case, tmp_path / "again") == files_of(case / "result")
+    page.keyboard.press("Control+z")
+    until_order(page, case, lambda o: "landmarks" not in o)
+    page.keyboard.press("Control+z")
+    until_order(page, case, lambda o: "edits" not in o)
+
+
+def test_tools_write_what_they_say(serve, browse):
+    """Paint, cut, region and ostium, and taking single corrections back; by keyboard as well."""
+    address, cases = serve(lambda desk: desk.demo().id)
+    page = browse(address, 1500)
+    case = cases / "demo"
+    finished(page)
+    page.click("[data-tool=paint]")
+    page.locator(".view canvas").first.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Enter")
+    until_order(page, case, lambda o: "edits" in o)
+    assert order_of(case)["edits"]["1"][0]["points"][0] == [261, 256]
+    page.click("[data-tool=region]")
+    for place in ((30, 30), (480, 30), (480, 480), (30, 480)):
+        click(page, 2, place)
+    page.keyboard.press("Enter")
+    until_order(page, case, lambda o: "regions" in o)
+    assert np.allclose(order_of(case)["regions"]["2"], [(30, 30), (480, 30), (480, 480), (30, 480)],
+                       atol=1.5)  # fmt: skip
+    page.click("[data-tool=cut]")
+    click(page, 1, (150, 190))
+    click(page, 1, (160, 330))
+    until_order(page, case, lambda o: len(o["edits"]["1"]) == 2)
+    cut = order_of(case)["edits"]["1"][1]
+    assert cut["do"] == "erase" and len(cut["points"]) > 20
+    page.click("#corrections li:has-text('erased') button")
+    until_order(page, case, lambda o: len(o["edits"]["1"]) == 1)
+    page.click("#corrections li:has-text('region') button")
+    until_order(page, case, lambda o: "regions" not in o)
+
+
+@pytest.mark.parametrize("width", [1280, 820, 390])
+def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width):
+    address, _ = serve(lambda desk: desk.demo().id)
+    page = browse(address, width)
+    finished(page)
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    page.click("#geometry summary")
+    page.click("#files-of summary")
+    # The page's policy holds for scripts that it loads; the browser's own door is another.
+    page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
+    found = page.evaluate("axe.run()")
+    bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
+    told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in bad]
+    assert found["passes"] and not told, told
+
+
+def test_one_printed_page(serve, browse):
+    address, _ = serve(lambda desk: desk.demo().id)
+    page = browse(address)
+    finished(page)
+    page.wait_for_timeout(300)
+    document = page.pdf(format="A4", landscape=True, print_background=True)
+    assert document.count(b"/Type /Page\n") + document.count(b"/Type /Page ") == 1
+
+
+@pytest.mark.benchmark
+def test_demo_takes_less_than_ten_seconds(serve, browse):
+    address, _ = serve()
+    page = browse(address)
+    page.wait_for_selector("#demo:visible")
+    started = time.perf_counter()
+    page.click("#demo")
+    page.wait_for_selector("#lesions tbody tr")
+    assert time.perf_counter() - started < 10

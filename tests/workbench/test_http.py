@@ -1,0 +1,159 @@
+"""The workbench over HTTP: who is answered, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+
+from gcar_deploy.engine import Engine
+from gcar_deploy.workbench.desk import Desk
+from gcar_deploy.worker.jobs import JobQueue
+from tests.cli.conftest import good_case  # noqa: F401 - a fixture
+from tests.workbench.conftest import TOKEN
+
+pytest.importorskip("flask")
+pytest.importorskip("waitress")
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+@pytest.fixture
+def desk(tmp_path):
+    return Desk(tmp_path / "cases")
+
+
+@pytest.fixture
+def ask(desk):
+    from gcar_deploy.workbench.http import create_app
+
+    def work(order, on_progress, cancel):
+        return desk.work(Engine(threads=1), order, on_progress, cancel)
+
+    queue = JobQueue(work)
+    client = create_app(desk, queue, TOKEN).test_client()
+    yield lambda method, path, **more: client.open(
+        path, method=method, **{"headers": BEARER, "base_url": "http://127.0.0.1:80", **more}
+    )
+    queue.close()
+
+
+def test_only_the_page_itself_needs_no_token(ask, desk):
+    case = desk.demo()
+    paths = ["/api/desk", f"/api/cases/{case.id}", f"/api/cases/{case.id}/views/1/picture.png"]
+    for path in paths:
+        assert ask("GET", path, headers={}).status_code == 401
+        assert ask("GET", path, headers={"Authorization": "Bearer no"}).status_code == 401
+        assert ask("GET", path).status_code == 200
+    for method, path in (("POST", "/api/demo"), ("PUT", f"/api/cases/{case.id}/order")):
+        assert ask(method, path, headers={}, json={}).status_code == 401
+    assert len(desk.cases) == 1
+    page = ask("GET", "/", headers={})
+    assert (
+        page.status_code == 200 and "default-src 'none'" in page.headers["Content-Security-Policy"]
+    )
+    assert TOKEN.encode() not in page.data
+    assert ask("GET", "/main.js", headers={}).mimetype == "text/javascript"
+    for name in ("/../case.py", "/..%2fcase.py", "/case.py", "/nothing.js"):
+        assert ask("GET", name, headers={}).status_code in (401, 404)
+
+
+def test_pages_of_others_and_foreign_names_are_turned_away(ask):
+    for origin in ("http://127.0.0.1:81", "http://evil.example", "null"):
+        assert ask("GET", "/api/desk", headers={**BEARER, "Origin": origin}).status_code == 403
+    own = ask("GET", "/api/desk", headers={**BEARER, "Origin": "http://127.0.0.1"})
+    assert own.status_code == 200
+    assert ask("GET", "/api/desk", base_url="http://evil.example").status_code in (400, 421)
+
+
+def test_result_files_have_an_address_of_their_own(ask, desk):
+    case = desk.demo()
+    found = ask("GET", f"/files/{case.key}/order.json", headers={})
+    assert json.loads(found.data)["out"] == "result"
+    for path in ("/files/wrong/order.json", f"/files/{case.key}/../order.json",
+                 f"/files/{case.key}/..%2forder.json"):  # fmt: skip
+        assert ask("GET", path, headers={}).status_code in (401, 404)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"views": ["a", "b"]}, "'views' is none of edits"),
+        ({"out": "elsewhere"}, "'out' is none of"),
+        ({"edits": {"3": []}}, "edits 3: there are views 1 .. 2"),
+        ({"edits": {"1": [{"do": "cut"}]}}, "edits.1[0].do"),
+        ({"deleted_mm": [[1, 2]]}, "deleted_mm"),
+    ],
+)
+def test_wrong_corrections_change_nothing(ask, desk, values, words):
+    case = desk.demo()
+    before = case.order_file.read_bytes()
+    answer = ask("PUT", f"/api/cases/{case.id}/order", json=values)
+    assert case.order_file.read_bytes() == before
+    assert answer.status_code == 400 and words in answer.json["error"]["message"]
+
+
+def test_dropped_files_become_a_case(ask, desk, good_case):  # noqa: F811
+    def drop(*names):
+        files = [("file", (io.BytesIO((good_case / n).read_bytes()), n)) for n in names]
+        from werkzeug.datastructures import MultiDict
+
+        return ask("POST", "/api/cases", data=MultiDict(files))
+
+    found = drop("view2.png", "geom.json", "view1.png")
+    assert found.status_code == 200 and found.json["problem"] is None, found.data
+    assert [view["id"] for view in found.json["views"]] and found.json["order"]["views"] == [
+        "view1.png", "view2.png",
+    ]  # fmt: skip
+    assert drop("view1.png", "geom.json").json["error"]["message"].startswith("1 pictures and 1")
+    bare = drop("view1.png", "view2.png")
+    assert "geometry is needed" in bare.json["problem"]
+    assert ask("POST", "/api/cases/none/run").status_code == 400
+
+
+def test_epipolar_line_goes_through_the_other_picture_of_a_point(ask, desk):
+    import numpy as np
+
+    case = desk.demo()
+    carms = [a.carm for a in case.angiograms()]
+    place = np.array([[5.0, -8.0, 12.0]])
+    first, second = (carm.project(place)[0][0] for carm in carms)
+    found = ask("POST", f"/api/cases/{case.id}/views/1/epipolar", json={"point": first.tolist()})
+    (line,) = found.json["views"]
+    a, b = (np.array(end) for end in line["line"])
+    along = (b - a) / np.linalg.norm(b - a)
+    gap = abs(along[0] * (second - a)[1] - along[1] * (second - a)[0])
+    assert line["view"] == 2 and gap < 0.05 and line["crossings"] == []
+
+
+def test_crossings_are_the_vessels_on_the_line():
+    import numpy as np
+
+    from gcar_deploy.workbench.shown import _crossings
+
+    skeleton = np.zeros((50, 50), bool)
+    skeleton[:, 10] = skeleton[:, 30] = True
+    found = _crossings(np.array([0.0, 1.0, -20.0]), skeleton)
+    assert sorted(found) == [[10.0, 20.0], [30.0, 20.0]]
+
+
+def test_a_trace_follows_the_line_not_the_chord():
+    import numpy as np
+
+    from gcar_deploy.geometry.scene import Intensity
+    from gcar_deploy.imaging.angiogram import Angiogram
+    from gcar_deploy.workbench.trace import trace
+
+    angle = np.linspace(0, np.pi, 400)
+    columns, rows = 60 + 40 * np.cos(angle), 80 - 40 * np.sin(angle)
+    r, c = np.mgrid[0:100, 0:120]
+    gap = np.min(np.hypot(r[..., None] - rows, c[..., None] - columns), axis=-1)
+    pixels = np.exp(-0.5 * (gap / 2) ** 2).astype(np.float32)
+    picture = Angiogram.without_geometry(
+        "1", (pixels, 8, "0"), Intensity(kind="path_length", mm_per_count=1.0)
+    )
+    ends = np.array([100.0, 80.0]), np.array([20.0, 80.0])
+    found = trace(picture, None, ends)
+    points = np.array(found["points"])
+    assert abs(np.hypot(points[:, 0] - 60, points[:, 1] - 80) - 40).max() < 3
+    assert 4 < found["width_px"] < 14
