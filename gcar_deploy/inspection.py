@@ -110,7 +110,8 @@ def inspect_files(
         segmenter, missing = asked_network(angiograms, options.imaging, loaded)
         found.warnings += missing
         landmark_pixels(options.landmarks, carms)  # named as the user numbers the views
-        landmark_pixels(options.ostia, carms)
+        for marks in (options.same_branch, options.ostia):
+            landmark_pixels(marks, carms)
         frame = own_frame(carms, [a.sha256 for a in angiograms])
         own, asked = in_own_frame(frame, angiograms, options)
         for k, angiogram in zip(frame.order, own, strict=True):

@@ -75,7 +75,8 @@ def reconstruct(
         raise UsageError(f"{len(angiograms)} picture given; two or more are needed")
     check_options(options)
     landmark_pixels(options.landmarks, [a.carm for a in angiograms])  # refuse before any work
-    landmark_pixels(options.ostia, [a.carm for a in angiograms])
+    for marks in (options.same_branch, options.ostia):
+        landmark_pixels(marks, [a.carm for a in angiograms])
     watch = Stopwatch(STAGES, on_progress=on_progress, deadline_s=deadline_s, cancel=cancel,
                       used_s=used_s)  # fmt: skip
     frame = own_frame([a.carm for a in angiograms], [a.sha256 for a in angiograms])

@@ -16,7 +16,7 @@ from gcar_deploy.batch.work import BatchEngine
 from gcar_deploy.config import Landmark
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import text_of
-from gcar_deploy.inputs.order import Order, check_views
+from gcar_deploy.inputs.order import Order, check_views, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark
 
 #: names become folders
@@ -52,7 +52,9 @@ def read_cases(table: Path, like: Order) -> list[BatchCase]:
     """Read ``case,geom,view1,view2[,view3 ...]``; paths are relative to the table.
 
     ``geom`` may be empty where the views are DICOM XA. Columns ``mask1`` ... and those of
-    ``COLUMNS`` say more of a case; an empty field leaves what ``like`` says.
+    ``COLUMNS`` say more of a case; an empty field leaves what ``like`` says. Column ``order``
+    names an order file, as ``gcar open`` keeps it: pictures, geometry and corrections are its own
+    where the line leaves them empty.
 
     Parameters
     ----------
@@ -96,7 +98,7 @@ def _view_columns(table: Path, names: Any) -> list[str]:
     if views[:2] != ["view1", "view2"]:
         raise UsageError(f"{table.name}: columns 'view1' and 'view2' are missing")
     unknown = {name for name in names if not _MASK.fullmatch(name)}
-    unknown -= {"case", "geom", *views, *COLUMNS}
+    unknown -= {"case", "geom", "order", *views, *COLUMNS}
     if unknown:
         raise UsageError(f"{table.name}: unknown column {sorted(unknown)[0]!r}")
     return views
@@ -117,20 +119,35 @@ def _case(
     cells = [told[column] for column in columns]
     while cells and not cells[-1]:
         cells.pop()
-    if len(cells) < 2 or not all(cells):
+    whole = bool(told.get("order")) and not cells
+    if not whole and (len(cells) < 2 or not all(cells)):
         raise UsageError(f"{where}: two or more views, without a gap, are needed")
     try:
+        base = _like(like, table.parent / told["order"]) if told.get("order") else like
+        masks = {int(k[4:]): Path(v) for k, v in told.items() if _MASK.fullmatch(k) and v}
         order = dataclasses.replace(
-            like,
-            views=tuple(Path(cell) for cell in cells),
-            geometry=Path(told["geom"]) if told["geom"] else None,
-            masks={int(k[4:]): Path(v) for k, v in told.items() if _MASK.fullmatch(k) and v},
+            base,
+            views=base.views if whole else tuple(Path(cell) for cell in cells),
+            geometry=Path(told["geom"]) if told["geom"] else base.geometry,
+            masks={**base.masks, **masks},
             **{COLUMNS[k][0]: COLUMNS[k][1](v) for k, v in told.items() if k in COLUMNS and v},
         )
         check_views(order)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from None
     return BatchCase(name, order.relative_to(table.parent))
+
+
+def _like(like: Order, file: Path) -> Order:
+    """Return an order file's order, with what holds for every case over it, without its folder."""
+    own = load_order(file).with_files(lambda _, path: path.absolute())
+    plain = Order()
+    said = {
+        field.name: value
+        for field in dataclasses.fields(Order)
+        if (value := getattr(like, field.name)) != getattr(plain, field.name)
+    }
+    return dataclasses.replace(own, out=None, force=False, **said)
 
 
 def _number(text: str) -> float:

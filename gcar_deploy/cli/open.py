@@ -19,7 +19,7 @@ _FOLDER = Path("gcar-cases")
 
 
 @click.command("open")
-@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="[VIEW ... | CASE]")
+@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="[VIEW ... | FOLDER]")
 @order_options("out", *METHOD, *READING, "file")
 @click.option("--no-browser", is_flag=True, help="Print the address; open nothing.")
 @click.option(
@@ -31,9 +31,10 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
     """See a case in the browser, correct it, run it again.
 
     Without an argument there is a start page: the demo in one click, or drop files. With pictures
-    or DICOM runs the case is opened; with the folder of an earlier case that one. Each case has a
-    folder below --out (gcar-cases by default) with order.json, which holds every correction, and
-    the result: gcar run --order CASE/order.json makes the same files again.
+    or DICOM runs the case is opened; with the folder of an earlier case that one; with any other
+    result folder its report. Each case has a folder below --out (gcar-cases by default) with the
+    result and order.json, which holds every correction: gcar run --order CASE/order.json makes
+    the same files again.
 
     The server listens on 127.0.0.1 alone and answers who bears its token, a part of the address.
     Ctrl-C ends it.
@@ -53,7 +54,7 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
     from gcar_deploy.worker.loopback import LOOPBACK, listen
 
     desk = Desk((order.out or _FOLDER).absolute())
-    first = _first(desk, order)
+    first, shelved = _first(desk, order)
     warm = engine.engine(Order())
     # While the start page is read, the first of everything is loaded.
     threading.Thread(target=warm.warmup, name="gcar-warmup", daemon=True).start()
@@ -61,7 +62,8 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
     try:
         token = secrets.token_urlsafe(32)
         server = listen(create_app(desk, queue, token, first), port)
-        address = f"http://{LOOPBACK}:{server.effective_port}/#{token}"
+        host = f"http://{LOOPBACK}:{server.effective_port}"
+        address = f"{host}/files/{shelved}/report.html" if shelved else f"{host}/#{token}"
         click.echo(address)
         if not no_browser:
             webbrowser.open(address)
@@ -75,14 +77,20 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
         queue.close()
 
 
-def _first(desk: Any, order: Order) -> str | None:
-    """Put on the desk what the command names; return its name."""
+def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
+    """Put on the desk what the command names; return the case's name, or the key of a result."""
+    from gcar_deploy.errors import UsageError
     from gcar_deploy.workbench.desk import absolute
 
     views = order.views
     if not views:
-        return None
+        return None, None
     if len(views) == 1 and views[0].is_dir():
-        return str(desk.again(views[0]).id)
+        try:
+            return str(desk.again(views[0]).id), None
+        except UsageError:
+            if not (views[0] / "report.html").is_file():
+                raise
+            return None, str(desk.shelve(views[0]))
     check_views(order)
-    return str(desk.add(desk.new_folder("case"), absolute(order)).id)
+    return str(desk.add(desk.new_folder("case"), absolute(order)).id), None

@@ -76,6 +76,8 @@ class RunOptions:
     quality: QualityOptions = dataclasses.field(default_factory=QualityOptions)
     #: points marked in the pictures, which hold the views to each other
     landmarks: tuple[Landmark, ...] = ()
+    #: a place on one vessel in each of two views or more, not the same place of it
+    same_branch: tuple[Landmark, ...] = ()
     #: where arteries begin, marked in two views or more
     ostia: tuple[Landmark, ...] = ()
     #: a place on each branch that is to go, mm LPS, in the order of deletion

@@ -25,6 +25,7 @@ def in_own_frame(
     return seen, dataclasses.replace(
         options,
         landmarks=ordered(options.landmarks),
+        same_branch=ordered(options.same_branch),
         ostia=ordered(options.ostia),
         deleted_mm=tuple((x - x0, y - y0, z - z0) for x, y, z in options.deleted_mm),
     )

@@ -68,6 +68,7 @@ class Order:
     landmarks : points marked in the pictures, (column, row) in each view or None
     edits : number of the view, from 1 -> strokes that erase or paint vessel, in their order
     regions : number of the view -> corners of the part that is looked at
+    same_branch : a place on one vessel in each view, not the same place of it, or None
     ostia : where arteries begin, points as of ``landmarks``
     deleted_mm : a place on each branch that is to go, mm LPS, in the order of deletion
     frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
@@ -87,6 +88,7 @@ class Order:
     landmarks: tuple[Landmark, ...] | None = None
     edits: Mapping[int, tuple[Stroke, ...]] = dataclasses.field(default_factory=dict)
     regions: Mapping[int, tuple[Place, ...]] = dataclasses.field(default_factory=dict)
+    same_branch: tuple[Landmark, ...] | None = None
     ostia: tuple[Landmark, ...] | None = None
     deleted_mm: tuple[tuple[float, float, float], ...] | None = None
     frames: tuple[int | None, ...] | None = None
@@ -162,7 +164,7 @@ class Order:
             pose=dataclasses.replace(base.pose, **pose),
             predict=dataclasses.replace(base.predict, **_given(self, "predictor")),
             refine=dataclasses.replace(base.refine, **_given(self, "refiner")),
-            **_given(self, "landmarks", "ostia", "deleted_mm"),
+            **_given(self, "landmarks", "same_branch", "ostia", "deleted_mm"),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -246,6 +248,7 @@ def _order(values: Any) -> Order:
     readers: dict[str, Callable[[str, Any], Any]] = {
         "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,
         "edits": parse_edits, "regions": parse_regions, "ostia": _landmarks,
+        "same_branch": _landmarks,
         "deleted_mm": _deleted,
         "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
         "force": _truth, "out": _path, "extras": _texts,

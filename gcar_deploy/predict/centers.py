@@ -17,6 +17,7 @@ from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_deploy.predict.hull import Candidates, cubic_lattice, visual_hull
 from gcar_deploy.predict.lattices import mean_evidence, near_evidence, shifted_lattice
 from gcar_deploy.predict.resolution import Resolution, resolution
+from gcar_deploy.predict.same_branch import without_ghosts
 from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
 from gcar_deploy.stopwatch import Stopwatch
@@ -96,6 +97,7 @@ def seen_by_all(
         paths = [sampled_path(view, wanted.cell_mm) for view in views]
         hull = visual_hull(paths, cubic_lattice(grid, wanted.cell_mm), chosen)
         wanted = wanted.coarser(len(hull))
+    hull = without_ghosts(hull, views, options.same_branch)
     sampled = tuple((*p, view.calibrated) for p, view in zip(paths, views, strict=True))
     return Seen(tuple(views), sampled, hull, encode(hull, sampled), chosen)
 

@@ -30,8 +30,8 @@ ORDER_NAME = "order.json"
 RESULT_NAME = "result"
 #: what the page may change of an order
 CORRECTIONS = (
-    "edits", "regions", "landmarks", "ostia", "deleted_mm", "frames", "geometry", "pose",
-    "segmenter", "predictor", "refiner",
+    "edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry",
+    "pose", "segmenter", "predictor", "refiner",
 )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import secrets
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine, check_target_of, deliver
 from gcar_deploy.errors import UsageError
 from gcar_deploy.inputs.order import Order, load_order
-from gcar_deploy.workbench.case import ORDER_NAME, Case
+from gcar_deploy.workbench.case import ORDER_NAME, RESULT_NAME, Case
 
 MOST_CASES = 64
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
@@ -30,6 +31,7 @@ class Desk:
     def __init__(self, root: Path) -> None:
         self._root = root
         self._cases: dict[str, Case] = {}
+        self._shelf: dict[str, Path] = {}
         self._lock = threading.Lock()
 
     @property
@@ -76,18 +78,35 @@ class Desk:
         return self.add(self.new_folder("demo"), Order(views=case.pictures, geometry=case.geometry))
 
     def again(self, folder: Path) -> Case:
-        """Put a case of an earlier session on the desk.
+        """Put a case of an earlier session on the desk: its folder, or the result in it.
 
         Raises
         ------
         UsageError
-            The folder holds no order.
+            There is no order in it.
         """
         folder = folder.resolve()
+        if folder.name == RESULT_NAME and not (folder / ORDER_NAME).exists():
+            folder = folder.parent
         order = load_order(folder / ORDER_NAME).with_files(
             lambda _, path: path.relative_to(folder) if folder in path.parents else path
         )
         return self.add(folder, order)
+
+    def shelve(self, folder: Path) -> str:
+        """Lay a result without its order beside, only to be looked at; return its key."""
+        key = secrets.token_urlsafe(16)
+        self._shelf[key] = folder.resolve()
+        return key
+
+    def file(self, key: str, name: str) -> tuple[Path, str] | None:
+        """Folder and name of a file by the key in its address; None where nothing has it."""
+        if key in self._shelf:
+            return self._shelf[key], name
+        case = next((case for case in self._cases.values() if case.key == key), None)
+        if case is None:
+            return None
+        return (case.folder if name == ORDER_NAME else case.folder / RESULT_NAME), name
 
     def work(
         self, engine: Engine, order: Order, on_progress: Callable[[str, float], None], cancel: Any

@@ -6,7 +6,6 @@ of its address, which browsers send to nobody. The page's policy lets it talk to
 
 from __future__ import annotations
 
-import io
 import threading
 from http import HTTPStatus
 from importlib import resources
@@ -14,14 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flask import Flask, Response, request, send_file, send_from_directory
+from flask import Flask, Response, request, send_from_directory
 
 from gcar_deploy import __version__
 from gcar_deploy.dicom.choose import choose_frame, filling_and_motion
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.inputs.drawn import parse_point
 from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
-from gcar_deploy.output.glb import glb_bytes
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.workbench.case import RESULT_NAME, Case
 from gcar_deploy.workbench.desk import Desk
@@ -200,16 +198,10 @@ def _pictures(app: Flask, desk: Desk) -> None:
 
     @app.get("/files/<key>/<name>")
     def file_of(key: str, name: str) -> Any:
-        case = next((c for c in map(desk.case, desk.cases) if c and c.key == key), None)
-        if case is None:
+        found = desk.file(key, name)
+        if found is None:
             return error("no such file", 2, HTTPStatus.NOT_FOUND)
-        if name == "surface.glb" and case.result is not None:
-            from gcar_deploy.tree.surface import lumen_surface
-
-            return send_file(io.BytesIO(glb_bytes(lumen_surface(case.result.tree, 0.4))),
-                             mimetype="model/gltf-binary")  # fmt: skip
-        folder = case.folder if name == "order.json" else case.folder / RESULT_NAME
-        return send_from_directory(folder.absolute(), name, max_age=0)
+        return send_from_directory(*found, max_age=0)
 
 
 def _seen(case: Case) -> tuple[list[Any], list[Any] | None]:

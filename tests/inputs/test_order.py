@@ -25,7 +25,7 @@ from gcar_deploy.inputs.order import (
 
 _names = st.text("abcäö 1./-", min_size=1, max_size=12).map(Path)
 _points = st.none() | st.tuples(st.floats(0, 4000), st.floats(0, 4000))
-_corners = st.lists(st.tuples(st.floats(0, 4000), st.floats(0, 4000)), min_size=3, max_size=5).map(
+_corners = st.lists(st.tuples(st.floats(0, 4000), st.floats(0, 4000)), min_size=3, max_size=4).map(
     tuple
 )
 _strokes = st.builds(
@@ -49,10 +49,11 @@ def orders(draw) -> Order:
         geometry=draw(st.none() | _names | st.just({"schema": "gcar-geometry/1", "views": []})),
         masks=draw(st.dictionaries(numbers, _names, max_size=3)),
         landmarks=None if pose == "off" else draw(st.none() | landmarks),
-        edits=draw(st.dictionaries(numbers, st.lists(_strokes, min_size=1, max_size=3).map(tuple))),
-        regions=draw(st.dictionaries(numbers, _corners)),
-        ostia=draw(st.none() | landmarks),
-        deleted_mm=draw(st.none() | st.lists(_places, min_size=1, max_size=3).map(tuple)),
+        edits=draw(st.dictionaries(numbers, _strokes.map(lambda one: (one, one)), max_size=1)),
+        regions=draw(st.dictionaries(numbers, _corners, max_size=1)),
+        same_branch=draw(st.none() | st.tuples(landmark)),
+        ostia=draw(st.none() | st.tuples(landmark)),
+        deleted_mm=draw(st.none() | st.tuples(_places)),
         frames=draw(st.none() | st.lists(st.none() | st.integers(1, 900), min_size=1).map(tuple)),
         pixel_spacing_mm=draw(st.none() | st.floats(0.02, 10)),
         sod_mm=draw(st.none() | st.floats(300, 5000)),
@@ -89,6 +90,7 @@ def test_every_order_makes_options_that_pass_their_checks(order):
         ("sod_mm", options.dicom.sod_mm),
         ("pixel_spacing_mm", options.dicom.pixel_spacing_mm),
         ("landmarks", options.landmarks),
+        ("same_branch", options.same_branch),
         ("ostia", options.ostia),
         ("deleted_mm", options.deleted_mm),
     ):

@@ -16,7 +16,9 @@ export function table(store, erase) {
     const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
       fixed(row.minimal_diameter_mm, 2), fixed(row.reference_diameter_mm, 2), fixed(row.lesion_length_mm, 1),
       row.minimal_at_mm === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0), fixed(row.mean_sigma_mm, 2)];
-    const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch));
+    const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
+      // Rounded down: what is not certain never reads 100 %.
+      row.name ? el("small", { title: "probability of the name by anatomy" }, ` ${Math.floor(100 * row.name_confidence)} %`) : "");
     jump.querySelector(".swatch").style.background = colorOf(branch.branch);
     const drop = el("button", { type: "button", class: "small", "aria-label": `Delete branch ${branch.branch}`, title: "Delete this branch (Delete)", onclick: e => { e.stopPropagation(); erase(branch); } }, "Delete");
     return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : "", onclick: () => jumpTo(store, branch) },
@@ -127,7 +129,7 @@ export class Curve {
   }
   said({ branch, start }, i) {
     const reference = branch.reference[i], sigma = branch.sigma[i];
-    return `Branch ${nameOf(branch)}, ${(start + branch.arc[i]).toFixed(1)} mm from the ostium: ${(2 * branch.radius[i]).toFixed(2)} mm` +
+    return `Branch ${nameOf(branch)} (confidence ${Math.floor(100 * branch.row.confidence)} %), ${(start + branch.arc[i]).toFixed(1)} mm from the ostium: ${(2 * branch.radius[i]).toFixed(2)} mm` +
       (reference === null ? "" : `, reference ${(2 * reference).toFixed(2)} mm (${Math.max(0, Math.round(100 * (1 - branch.radius[i] / reference)))} % narrower)`) +
       (sigma === null ? "." : `, \u00b1 ${sigma.toFixed(2)} mm.`);
   }

@@ -33,6 +33,7 @@ export function corrections(store, say) {
     add(`View ${view}: region`, { regions });
   }
   (now.landmarks ?? []).forEach((_, k) => add(`Landmark L${k + 1}`, { landmarks: without(now.landmarks, k) }));
+  (now.same_branch ?? []).forEach((_, k) => add(`Same branch B${k + 1}`, { same_branch: without(now.same_branch, k) }));
   (now.ostia ?? []).forEach((_, k) => add(`Ostium O${k + 1}`, { ostia: without(now.ostia, k) }));
   (now.deleted_mm ?? []).forEach((place, k) => add(`Branch deleted at (${place.map(x => x.toFixed(0)).join(", ")}) mm`, { deleted_mm: without(now.deleted_mm, k) }));
   $("corrections").hidden = !lines.length;
@@ -41,7 +42,7 @@ export function corrections(store, say) {
 
 const ABOUT = {
   "report.html": "report, one page for the record", "result.json": "all figures", "volume.nii.gz": "volume (NIfTI)",
-  "surface.stl": "surface", "surface.glb": "surface for viewers", "centerline.vtp": "centreline (VTK)",
+  "surface.stl": "surface", "centerline.vtp": "centreline (VTK)",
   "centerline.csv": "centreline (table)", "gaussians.npz": "Gaussians", "gaussians.ply": "Gaussians (3DGS)",
 };
 
@@ -50,7 +51,6 @@ export function files(store) {
   $("files-of").hidden = !store.result;
   if (!store.result) return;
   const { summary, files: sizes } = store.result, base = `/files/${store.info.key}`;
-  const names = [...new Set([...Object.keys(sizes), "surface.glb"])];
   const link = name => el("a", { href: `${base}/${name}`, ...(name === "report.html" ? { target: "_blank" } : { download: name }) },
     `${name}${ABOUT[name] ? ` \u2013 ${ABOUT[name]}` : ""}`);
   const model = one => one ? `${one.name} (${one.sha256.slice(0, 12)})` : "none";
@@ -59,6 +59,6 @@ export function files(store) {
     ["Refinement", `${summary.refiner}, ${summary.counts.steps} steps`],
     ...summary.views.map(v => [`Picture ${v.id}`, `${v.picture.columns} x ${v.picture.rows}, ${v.picture.bit_depth} bit, ${v.kind}, SHA-256 ${v.picture.sha256.slice(0, 12)}`]),
     ...Object.entries(summary.versions).map(([name, version]) => [name, version ?? "not installed"])];
-  room.replaceChildren(el("div", { class: "links" }, link("order.json"), ...names.map(link)),
+  room.replaceChildren(el("div", { class: "links" }, link("order.json"), ...Object.keys(sizes).map(link)),
     el("table", { class: "names" }, el("tbody", {}, ...rows.map(([name, value]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, value))))));
 }

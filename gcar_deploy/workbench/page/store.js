@@ -2,7 +2,7 @@
 import * as api from "./api.js";
 
 // What is undone and redone: keys of the order that the page changes.
-const KEYS = ["edits", "regions", "landmarks", "ostia", "deleted_mm", "frames", "geometry"];
+const KEYS = ["edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry"];
 const corrections = order => Object.fromEntries(KEYS.map(key => [key, order[key] ?? null]));
 const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 

@@ -9,9 +9,11 @@ export const TOOLS = [
   ["cut", "Cut catheter", "C", "Click the catheter at both ends of the part to be cut; the line between is found."],
   ["region", "Region", "G", "Click the corners of what is to be looked at; double-click or Enter closes it."],
   ["landmark", "Landmark pair", "L", "Click a point (a fork, a kink) in one view, then the same in the other, on the dashed line."],
+  ["same", "Same branch", "B", "Click a vessel in one view, then the same vessel in the other, at any place between its forks."],
   ["ostium", "Ostium", "O", "Click where the artery begins in one view, then in the other, on the dashed line."],
 ];
 const round = point => point.map(x => Math.round(x * 10) / 10);
+const KEYS = { landmark: "landmarks", same: "same_branch", ostium: "ostia" };
 const INK = { erase: "#ff7a33", paint: "#56b4e9" };
 /** A click this near to a crossing is put onto it, CSS pixels. */
 const SNAP = 18;
@@ -101,14 +103,14 @@ export class Toolbox {
     this.mark[k] = round(near && near[0] < SNAP ? near[1] : place);
     const marked = this.mark.filter(point => point).length;
     if (marked === views) return this.keepMark();
-    if (marked === 1) {
+    if (marked === 1 && this.name !== "same") {
       const found = await api.post(`${this.store.path}/views/${picture.number}/epipolar`, { point: this.mark[k] });
       this.lines = found.views;
     }
     this.redraw();
   }
   keepMark() {
-    const key = this.name === "ostium" ? "ostia" : "landmarks";
+    const key = KEYS[this.name];
     const mark = this.mark;
     this.mark = null; this.lines = [];
     return this.change({ [key]: [...this.store.now[key] ?? [], mark] });
@@ -126,7 +128,8 @@ export class Toolbox {
     if (line?.line.length && !this.mark?.[view - 1]) this.epipolar(ctx, line, put);
     (now.landmarks ?? []).forEach((mark, k) => this.spot(ctx, mark[view - 1], `L${k + 1}`, put));
     (now.ostia ?? []).forEach((mark, k) => this.spot(ctx, mark[view - 1], `O${k + 1}`, put));
-    this.spot(ctx, this.mark?.[view - 1], this.name === "ostium" ? "O" : "L", put);
+    (now.same_branch ?? []).forEach((mark, k) => this.spot(ctx, mark[view - 1], `B${k + 1}`, put));
+    this.spot(ctx, this.mark?.[view - 1], this.name[0].toUpperCase(), put);
   }
   line(ctx, picture, stroke) {
     const at = stroke.points.map(p => picture.put(p));
