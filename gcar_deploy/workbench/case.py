@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import PictureLimits, RunOptions
 from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import is_dicom, read_header
 from gcar_deploy.errors import GcarError, UsageError
@@ -20,6 +20,7 @@ from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.geometry.scene import Scene, View, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.vessels import Vessels
 from gcar_deploy.inputs.order import Order, order_to_json, parse_order
 from gcar_deploy.inputs.pictures import prepare
@@ -50,6 +51,7 @@ class Case:
     order : Order
     result : of the last run that ended well, None before
     job_id : of the last run, None before
+    vessels : found by the last run, refused or not, in the order of the views; empty before
     """
 
     def __init__(self, folder: Path, order: Order) -> None:
@@ -57,7 +59,9 @@ class Case:
         self.key = secrets.token_urlsafe(16)
         self.result: Result | None = None
         self.job_id: str | None = None
-        self._steps: list[Step] = []
+        self.vessels: tuple[VesselImage, ...] = ()
+        self._frame: OwnFrame | None = None
+        self._read: tuple[str, tuple[tuple[Angiogram, ...], list[str]]] | None = None
         self._lock = threading.Lock()
         self.order = dataclasses.replace(order, out=Path(RESULT_NAME), force=True)
         self._keep()
@@ -91,19 +95,10 @@ class Case:
     def take_step(self, step: Step) -> None:
         """Remember what a run hands on, so that a refused one can be looked at as well."""
         if isinstance(step, OwnFrame):
-            self._steps = [step]
-        elif isinstance(step, Vessels):
-            self._steps.append(step)
-
-    @property
-    def vessels(self) -> tuple[VesselImage, ...]:
-        """Vessels that the last run found, in the order of the views; empty before."""
-        if len(self._steps) < 2:
-            return ()
-        frame, found = self._steps[:2]
-        if not (isinstance(frame, OwnFrame) and isinstance(found, Vessels)):
-            return ()
-        return tuple(found.views[frame.place(k)] for k in range(len(found.views)))
+            self._frame = step
+        elif isinstance(step, Vessels) and self._frame is not None:
+            places = map(self._frame.place, range(len(step.views)))
+            self.vessels = tuple(step.views[place] for place in places)
 
     def angiograms(self) -> tuple[Angiogram, ...]:
         """Pictures with their geometry as it is told, without what was drawn in them.
@@ -120,7 +115,7 @@ class Case:
         out: dict[str, Any] = {
             "id": self.id, "key": self.key, "order": self.order.to_dict(),
             "order_file": str(self.order_file), "names": [p.name for p in self.order.views],
-            "views": [], "notes": [], "geometry": None, "problem": None,
+            "views": [], "notes": [], "geometry": None, "problem": None, "sizes": None,
             "job": self.job_id, "result": self.result is not None,
             "dicom": [is_dicom(path) for path in self.ready_order.views],
         }  # fmt: skip
@@ -129,6 +124,7 @@ class Case:
             out["geometry"] = self._geometry(angiograms)
         except GcarError as error:
             out["problem"] = str(error)
+            out["sizes"] = self._sizes()
             return out
         out["notes"] = notes
         out["views"] = [
@@ -158,12 +154,22 @@ class Case:
         order = self.ready_order
         # Only what tells how the pictures are read: drawing must not read them again.
         what = json.dumps({k: v for k, v in order.to_dict().items() if k in _READING})
-        if getattr(self, "_read", (None,))[0] != what:
+        if self._read is None or self._read[0] != what:
             found, _, notes = prepare(
                 order.views, order.geometry, order.options(RunOptions()), order.masks
             )
             self._read = what, (tuple(found), notes)
         return self._read[1]
+
+    def _sizes(self) -> list[tuple[int, int]] | None:
+        """(rows, columns) of pictures whose geometry nobody tells; None where it is told."""
+        if self.order.geometry is not None or any(map(is_dicom, self.ready_order.views)):
+            return None
+        try:
+            found = [read_picture(p, PictureLimits())[0] for p in self.ready_order.views]
+        except GcarError:
+            return None
+        return [(picture.shape[0], picture.shape[1]) for picture in found]
 
     def _geometry(self, angiograms: tuple[Angiogram, ...]) -> Any:
         told = self.ready_order.geometry

@@ -160,6 +160,8 @@ def _pictures(app: Flask, desk: Desk) -> None:
     @app.get("/api/cases/<case_id>/views/<int:view>/found.png")
     def found(case_id: str, view: int) -> Any:
         vessels = _case(desk, case_id).vessels
+        if not vessels:
+            return Response(status=HTTPStatus.NO_CONTENT)
         return _png(found_png(vessels[_place(view, len(vessels))]))
 
     @app.get("/api/cases/<case_id>/views/<int:view>/frames")

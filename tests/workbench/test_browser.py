@@ -191,7 +191,7 @@ def test_one_printed_page(serve, browse):
     page = browse(address)
     finished(page)
     page.wait_for_timeout(300)
-    document = page.pdf(format="A4", landscape=True, print_background=True)
+    document = page.pdf(prefer_css_page_size=True, print_background=True)
     assert document.count(b"/Type /Page\n") + document.count(b"/Type /Page ") == 1
 
 

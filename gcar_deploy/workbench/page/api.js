@@ -28,7 +28,11 @@ export const get = async path => (await answer("GET", path)).json();
 export const post = async (path, body) => (await answer("POST", path, body)).json();
 export const put = async (path, body) => (await answer("PUT", path, body)).json();
 export const remove = async path => (await answer("DELETE", path)).json();
-export const image = async path => createImageBitmap(await (await answer("GET", path)).blob());
+/** A picture; null where there is none yet. */
+export async function image(path) {
+  const found = await answer("GET", path);
+  return found.status === 204 ? null : createImageBitmap(await found.blob());
+}
 export const imageUrl = async path => URL.createObjectURL(await (await answer("GET", path)).blob());
 
 /** Follow a job to its end; tell is called with each state of it. */

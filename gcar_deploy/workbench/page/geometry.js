@@ -14,8 +14,31 @@ const FIELDS = [
 export function geometry(store, say) {
   const cards = $("geometry").querySelector(".cards");
   const told = store.info.geometry;
+  if (!told && store.info.sizes) { cards.replaceChildren(asked(store, say)); return; }
   if (!told) { cards.replaceChildren(el("p", {}, store.info.problem ?? "Not known.")); return; }
   cards.replaceChildren(...told.views.map((view, k) => card(store, say, view, k)));
+}
+
+/** A form for pictures that came without their geometry: nothing is guessed, all is asked. */
+function asked(store, say) {
+  const views = store.info.sizes.map(([rows, columns], k) => {
+    const inputs = FIELDS.filter(([key]) => key !== "detector_rotation_deg").map(([key, name, unit, least, most]) => [name, unit,
+      el("input", { type: "number", id: `new-${key}-${k}`, name: key, min: least, max: most, step: "any", required: true })]);
+    return { rows, columns, inputs, node: el("div", { class: "carm" }, el("h3", {}, `View ${k + 1}: ${store.info.names[k]}, ${columns} x ${rows}`),
+      el("div", { class: "numbers" }, ...inputs.flatMap(([name, unit, input]) => [el("label", { for: input.id }, name), input, el("span", {}, unit)]))) };
+  });
+  const use = async e => {
+    e.preventDefault();
+    const read = ({ rows, columns, inputs }, k) => {
+      const told = Object.fromEntries(inputs.map(([, , input]) => [input.name, Number(input.value)]));
+      return { id: String(k + 1), ...told, rows, columns, pixel_spacing_mm: [told.pixel_spacing_mm, told.pixel_spacing_mm] };
+    };
+    try {
+      await store.change({ geometry: { schema: "gcar-geometry/1", frame: "LPS", views: views.map(read) } });
+      if (!store.info.problem) { say(""); await store.run(); }
+    } catch (error) { say(error.message); }
+  };
+  return el("form", { class: "cards", onsubmit: use }, ...views.map(view => view.node), el("p", {}, el("button", { class: "main" }, "Use this geometry")));
 }
 
 function card(store, say, view, k) {

@@ -63,7 +63,7 @@ async function load() {
 }
 async function loadFound() {
   await Promise.all(pictures.map(async picture => {
-    try { picture.found = await api.image(`${store.path}/views/${picture.number}/found.png`); } catch { picture.found = null; }
+    picture.found = await api.image(`${store.path}/views/${picture.number}/found.png`);
     picture.draw();
   }));
 }
@@ -110,7 +110,7 @@ store.addEventListener("finished", () => {
   $("lumen").hidden = !done; scene.root.hidden = !done;
   status(store); buttons(); files(store);
   if (done) { table(store, erase); scene.take(); curve.take(); mark(); }
-  draw(); loadFound();
+  draw(); attempt(loadFound);
 });
 store.addEventListener("chosen", () => { mark(); curve.follow(); pictures.forEach(p => p.draw()); scene.draw(); });
 

@@ -8,7 +8,7 @@ const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 export class Store extends EventTarget {
   info = null; result = null; job = null; running = false;
-  chosen = 0; cursor = null; ran = null; #past = []; #future = [];
+  chosen = 0; cursor = null; ran = null; #past = []; #future = []; #runs = 0;
 
   get path() { return `/api/cases/${this.info.id}`; }
   get now() { return corrections(this.info.order); }
@@ -20,6 +20,7 @@ export class Store extends EventTarget {
   tell(what) { this.dispatchEvent(new Event(what)); }
 
   open(info) {
+    this.#runs++; this.running = false;
     Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null });
     this.#past = []; this.#future = [];
     this.tell("opened");
@@ -54,16 +55,18 @@ export class Store extends EventTarget {
 
   async run() {
     if (this.running) await this.cancel();
-    const asked = this.now, path = this.path;
+    const asked = this.now, path = this.path, own = ++this.#runs;
     this.running = true;
+    this.tell("progress");
     try {
       const begun = this.job = await api.post(`${path}/run`);
       const done = await api.follow(begun, job => {
-        if (this.job?.id === begun.id) { this.job = job; this.tell("progress"); }
+        if (own === this.#runs) { this.job = job; this.tell("progress"); }
       });
-      if (this.job?.id !== begun.id) return;
-      this.ran = asked;
-      this.result = done.state === "done" ? await api.get(`${path}/result`) : null;
+      const result = done.state === "done" ? await api.get(`${path}/result`) : null;
+      // A later run, or another case, has taken over.
+      if (own !== this.#runs) return;
+      Object.assign(this, { ran: asked, result });
       if (this.result) {
         const branches = this.result.scene.branches;
         this.chosen = branches.some(b => b.branch === this.chosen) ? this.chosen : worst(branches);
@@ -71,8 +74,10 @@ export class Store extends EventTarget {
       }
       this.tell("finished");
     } finally {
-      this.running = false;
-      this.tell("progress");
+      if (own === this.#runs) {
+        this.running = false;
+        this.tell("progress");
+      }
     }
   }
 
