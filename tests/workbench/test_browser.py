@@ -96,7 +96,7 @@ def test_demo_to_result_to_deletion_and_back(serve, browse, engine, tmp_path):
 
 
 def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
-    """Erase, landmark pair on its epipolar line, ostium, region; then run; all in the order."""
+    """Erase, landmark pair on its epipolar line, run, delete a branch, undo; the order repeats."""
     folder = data_dir() / "cases" / "R_0001"
     given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
     address, cases = serve(lambda desk: desk.add(desk.new_folder("raw"), given).id)
@@ -127,11 +127,19 @@ def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
     assert np.linalg.norm(np.array(pair[1]) - marks[1]) < 12
     page.click("#run")
     finished(page)
-    assert (
-        "1 strokes of the user erase vessel" in page.inner_text("#status")
-        or page.locator("#status details summary").count()
-    )
-    assert repeated(engine, case, tmp_path / "again") == files_of(case / "result")
+    page.click("#status summary >> nth=0")
+    assert "1 strokes of the user erase vessel" in page.inner_text("#status")
+    corrected, rows = files_of(case / "result"), page.locator("#lesions tbody tr")
+    before = rows.count()
+    page.locator("#lesions tbody button[aria-label^=Delete]").last.click()
+    until(page, lambda: rows.count() < before)
+    finished(page)
+    shorter = files_of(case / "result")
+    assert repeated(engine, case, tmp_path / "again") == shorter != corrected
+    page.click("#undo")
+    until(page, lambda: rows.count() == before)
+    finished(page)
+    assert files_of(case / "result") == corrected
     page.keyboard.press("Control+z")
     until_order(page, case, lambda o: "landmarks" not in o)
     page.keyboard.press("Control+z")
@@ -151,11 +159,11 @@ def test_tools_write_what_they_say(serve, browse):
     until_order(page, case, lambda o: "edits" in o)
     assert order_of(case)["edits"]["1"][0]["points"][0] == [261, 256]
     page.click("[data-tool=region]")
-    for place in ((30, 30), (480, 30), (480, 480), (30, 480)):
+    for place in ((30, 90), (480, 90), (480, 480), (30, 480)):
         click(page, 2, place)
     page.keyboard.press("Enter")
     until_order(page, case, lambda o: "regions" in o)
-    assert np.allclose(order_of(case)["regions"]["2"], [(30, 30), (480, 30), (480, 480), (30, 480)],
+    assert np.allclose(order_of(case)["regions"]["2"], [(30, 90), (480, 90), (480, 480), (30, 480)],
                        atol=1.5)  # fmt: skip
     page.click("[data-tool=cut]")
     click(page, 1, (150, 190))

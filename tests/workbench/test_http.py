@@ -108,6 +108,8 @@ def test_dropped_files_become_a_case(ask, desk, good_case):  # noqa: F811
     assert drop("view1.png", "geom.json").json["error"]["message"].startswith("1 pictures and 1")
     bare = drop("view1.png", "view2.png")
     assert "geometry is needed" in bare.json["problem"]
+    view = json.loads((good_case / "geom.json").read_text())["views"][0]
+    assert bare.json["sizes"] == [[view["rows"], view["columns"]]] * 2
     assert ask("POST", "/api/cases/none/run").status_code == 400
 
 
