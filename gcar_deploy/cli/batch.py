@@ -40,8 +40,8 @@ _WHERE = {
 @click.command("batch")
 @click.argument("table", type=click.Path(path_type=Path), metavar="CASES.CSV")
 @order_options(
-    "out", *METHOD, "frames", "pixel_spacing_mm", "sod_mm", "segmenter", "pose", "strict", "force",
-    *EXTRA_FILES,
+    "out", *METHOD, "frames", "pixel_spacing_mm", "sod_mm", "allow_rescale", "segmenter", "pose",
+    "strict", "force", *EXTRA_FILES,
 )  # fmt: skip
 @gathered("where", Where, _WHERE)
 @engine_options

@@ -55,6 +55,10 @@ OPTIONS: Mapping[str, _Option] = {
         "--sod", "sod_mm", type=click.FloatRange(300, 5000), metavar="MM",
         help="DICOM without it: source to isocentre.",
     ),
+    "allow_rescale": click.option(
+        "--allow-rescale", is_flag=True,
+        help="Take pictures of another size than their geometry's for rescaled ones.",
+    ),
     "segmenter": _choice(
         "segmenter", SEGMENTERS, _USUAL.imaging.segmenter,
         "Who finds vessels in raw pictures; auto takes the mean of both.",
@@ -86,7 +90,8 @@ OPTIONS: Mapping[str, _Option] = {
 }  # fmt: skip
 #: what tells how pictures are read
 READING = (
-    "geometry", "frames", "pixel_spacing_mm", "sod_mm", "segmenter", "pose", "landmarks", "masks",
+    "geometry", "frames", "pixel_spacing_mm", "sod_mm", "allow_rescale", "segmenter", "pose",
+    "landmarks", "masks",
 )  # fmt: skip
 #: what tells how a tree is made of them
 METHOD = ("predictor", "refiner", "deadline_s")

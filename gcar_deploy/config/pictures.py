@@ -51,3 +51,6 @@ class ImagingOptions:
     #: who finds vessels in grey values: the ridge filter, the network, or both (their mean, or the
     #: network alone where the views then agree better)
     segmenter: SegmenterName = "auto"
+    #: take a picture of another size than its geometry's for a rescaled one: a crop of the same
+    #: shape looks alike, and gives a tree of the wrong size
+    allow_rescale: bool = False

@@ -177,8 +177,17 @@ def scene_to_json(scene: Scene) -> str:
     return json.dumps(data, indent=1) + "\n"
 
 
-def match_picture(carm: CArm, rows: int, columns: int) -> tuple[CArm, str | None]:
+def match_picture(
+    carm: CArm, rows: int, columns: int, *, allow_rescale: bool
+) -> tuple[CArm, str | None]:
     """Fit a view to the size of its picture.
+
+    Parameters
+    ----------
+    carm : CArm
+    rows, columns : of the picture
+    allow_rescale : whether a picture of another size may be a rescaled one; it may as well be a
+        crop, which nobody can tell from it
 
     Returns
     -------
@@ -188,7 +197,7 @@ def match_picture(carm: CArm, rows: int, columns: int) -> tuple[CArm, str | None
     Raises
     ------
     GeometryError
-        The picture is not an exact rescaling of rows x columns.
+        The picture has another size and rescaling is not allowed, or is no exact one.
     """
     if (rows, columns) == (carm.rows, carm.columns):
         return carm, None
@@ -196,6 +205,12 @@ def match_picture(carm: CArm, rows: int, columns: int) -> tuple[CArm, str | None
         raise GeometryError(
             f"rows x columns = {carm.rows} x {carm.columns} is at odds with the picture's "
             f"{rows} x {columns}, which is no exact rescaling"
+        )
+    if not allow_rescale:
+        raise GeometryError(
+            f"rows x columns = {carm.rows} x {carm.columns} is at odds with the picture's "
+            f"{rows} x {columns}; allow_rescale (--allow-rescale) takes it for the whole picture "
+            "rescaled, which a crop is not"
         )
     scale = rows / carm.rows
     return carm.resized(rows, columns), (

@@ -73,6 +73,7 @@ class Order:
     deleted_mm : a place on each branch that is to go, mm LPS, in the order of deletion
     frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
     pixel_spacing_mm, sod_mm : for DICOM that does not say it, at the detector
+    allow_rescale : take a picture of another size than its geometry's for a rescaled one
     pose : ``auto`` or ``off``
     segmenter, predictor, refiner : who finds vessels, who decides depth, how the tree is fitted
     deadline_s : seconds that the work may take
@@ -94,6 +95,7 @@ class Order:
     frames: tuple[int | None, ...] | None = None
     pixel_spacing_mm: float | None = None
     sod_mm: float | None = None
+    allow_rescale: bool = False
     pose: str | None = None
     segmenter: str | None = None
     predictor: str | None = None
@@ -160,7 +162,11 @@ class Order:
         return dataclasses.replace(
             base,
             dicom=dataclasses.replace(base.dicom, **dicom),
-            imaging=dataclasses.replace(base.imaging, **_given(self, "segmenter")),
+            imaging=dataclasses.replace(
+                base.imaging,
+                allow_rescale=self.allow_rescale or base.imaging.allow_rescale,
+                **_given(self, "segmenter"),
+            ),
             pose=dataclasses.replace(base.pose, **pose),
             predict=dataclasses.replace(base.predict, **_given(self, "predictor")),
             refine=dataclasses.replace(base.refine, **_given(self, "refiner")),
@@ -251,7 +257,7 @@ def _order(values: Any) -> Order:
         "same_branch": _landmarks,
         "deleted_mm": _deleted,
         "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
-        "force": _truth, "out": _path, "extras": _texts,
+        "force": _truth, "allow_rescale": _truth, "out": _path, "extras": _texts,
     }  # fmt: skip
     for key, read in readers.items():
         if key in given:

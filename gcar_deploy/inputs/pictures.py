@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import PictureLimits, RunOptions
+from gcar_deploy.config import ImagingOptions, PictureLimits, RunOptions
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
@@ -45,7 +45,7 @@ def prepare(
     ----------
     views : 2 or more pictures, in the order of the geometry's views
     geometry : where they were taken from; None where DICOM headers say it
-    options : RunOptions, of which ``dicom`` and ``imaging.limits`` are used
+    options : RunOptions, of which ``dicom`` and ``imaging`` are used
     masks : number of the view, from 1 -> vessel mask (picture of its size)
     drawn : number of the view -> strokes and region of interest
 
@@ -58,7 +58,7 @@ def prepare(
     UsageError
         Fewer than two pictures, or a mask or strokes of no view.
     GeometryError
-        Not as many pictures as views, or sizes at odds.
+        Not as many pictures as views, or sizes at odds (see ``match_picture``).
     ImageError
         A picture or mask cannot be read.
     """
@@ -157,25 +157,25 @@ def _by_scene(
             angiograms.append(picture)
         elif isinstance(picture, (str, Path)) and is_dicom(picture):
             run = read_run(picture, options.dicom, frames.pop(0))
-            carm = _matched(view, run.pixels.shape, notes)
+            carm = _matched(view, run.pixels.shape, options.imaging, notes)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
             notes += [f"view {view.id}: {note}" for note in run.notes]
         else:
-            angiograms.append(_angiogram(picture, view, options.imaging.limits, notes))
+            angiograms.append(_angiogram(picture, view, options.imaging, notes))
     return angiograms, scene.volume_grid(), notes
 
 
 def _angiogram(
-    picture: str | Path | np.ndarray, view: View, limits: PictureLimits, notes: list[str]
+    picture: str | Path | np.ndarray, view: View, options: ImagingOptions, notes: list[str]
 ) -> Angiogram:
     """Read a picture file, or take an array; what was rescaled is added to ``notes``."""
     if isinstance(picture, np.ndarray):
-        pixels, depth, sha256 = _from_array(view.id, picture, limits)
+        pixels, depth, sha256 = _from_array(view.id, picture, options.limits)
     else:
-        pixels, depth, sha256 = read_picture(picture, limits)
+        pixels, depth, sha256 = read_picture(picture, options.limits)
     return Angiogram(
-        view_id=view.id, carm=_matched(view, pixels.shape, notes), pixels=pixels, bit_depth=depth,
-        intensity=view.intensity, sha256=sha256,
+        view_id=view.id, carm=_matched(view, pixels.shape, options, notes), pixels=pixels,
+        bit_depth=depth, intensity=view.intensity, sha256=sha256,
     )  # fmt: skip
 
 
@@ -201,10 +201,12 @@ def _frames_for(views: Sequence[Picture], options: RunOptions) -> list[int | Non
     return list(wanted_frames(options.dicom, runs)) if runs else []
 
 
-def _matched(view: View, shape: tuple[int, ...], notes: list[str]) -> CArm:
+def _matched(view: View, shape: tuple[int, ...], options: ImagingOptions, notes: list[str]) -> CArm:
     """Fit a view to the size of its picture; what was rescaled is added to ``notes``."""
     try:
-        carm, note = match_picture(view.carm, shape[0], shape[1])
+        carm, note = match_picture(
+            view.carm, shape[0], shape[1], allow_rescale=options.allow_rescale
+        )
     except GeometryError as error:
         raise GeometryError(f"view {view.id}: {error}") from None
     if note:

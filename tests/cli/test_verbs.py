@@ -181,7 +181,7 @@ def test_info_of_something_else(content, tmp_path):
 
 
 @pytest.mark.req("REQ-05")
-def test_rescaled_pictures_are_taken_and_that_is_said(good_case, tmp_path):
+def test_rescaled_pictures_are_taken_where_that_is_allowed_and_said(good_case, tmp_path):
     case = tmp_path / "case"
     shutil.copytree(good_case, case)
     data = json.loads((case / "geom.json").read_text())
@@ -189,7 +189,12 @@ def test_rescaled_pictures_are_taken_and_that_is_said(good_case, tmp_path):
         view["rows"] = view["columns"] = 192
         view["pixel_spacing_mm"] = [0.8, 0.8]
     (case / "geom.json").write_text(json.dumps(data))
-    done = gcar(*run_arguments(case, tmp_path / "out"))
+    looked = ("validate", case / "view1.png", case / "view2.png", "--geom", case / "geom.json")
+    for call in (run_arguments(case, tmp_path / "out"), looked):
+        done = gcar(*call)
+        assert done.code == 4 and "view 1: rows" in done.err and "--allow-rescale" in done.err
+    assert not (tmp_path / "out").exists()
+    done = gcar(*run_arguments(case, tmp_path / "out", "--allow-rescale"))
     assert done.code == 0 and "0.5 times" in done.err
 
 

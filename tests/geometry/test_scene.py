@@ -233,12 +233,15 @@ def test_picture_of_another_size():
         **{k: v for k, v in VIEW.items() if k not in ("intensity", "pixel_spacing_mm")},
         pixel_spacing_mm=(0.39, 0.39),
     )
-    same, said = match_picture(carm, 512, 512)
+    same, said = match_picture(carm, 512, 512, allow_rescale=False)
     assert same is carm and said is None
-    half, said = match_picture(carm, 256, 256)
+    # a crop from the middle has the same shape and another scale: only the user knows
+    with pytest.raises(GeometryError, match=r"512 x 512 .* 256 x 256; allow_rescale"):
+        match_picture(carm, 256, 256, allow_rescale=False)
+    half, said = match_picture(carm, 256, 256, allow_rescale=True)
     assert half.rows == 256 and "0.5 times" in said
     with pytest.raises(GeometryError, match="at odds"):
-        match_picture(carm, 256, 512)
+        match_picture(carm, 256, 512, allow_rescale=True)
 
 
 #: what a JSON Schema cannot say: relations between values, and text that is not printable

@@ -57,6 +57,7 @@ def orders(draw) -> Order:
         frames=draw(st.none() | st.lists(st.none() | st.integers(1, 900), min_size=1).map(tuple)),
         pixel_spacing_mm=draw(st.none() | st.floats(0.02, 10)),
         sod_mm=draw(st.none() | st.floats(300, 5000)),
+        allow_rescale=draw(st.booleans()),
         pose=pose,
         segmenter=draw(st.none() | st.sampled_from(SEGMENTERS)),
         predictor=draw(st.none() | st.sampled_from(PREDICTORS)),
@@ -82,6 +83,7 @@ def test_every_order_makes_options_that_pass_their_checks(order):
     options = order.options(RunOptions())
     check_options(options)
     assert (options.pose.enabled is False) == (order.pose == "off")
+    assert options.imaging.allow_rescale == order.allow_rescale
     for key, told in (
         ("segmenter", options.imaging.segmenter),
         ("predictor", options.predict.predictor),
@@ -99,7 +101,9 @@ def test_every_order_makes_options_that_pass_their_checks(order):
 
 
 def test_what_an_order_leaves_open_is_as_the_engine_was_set_up():
-    base = Order(predictor="none", refiner="paper", pose="off", sod_mm=700).options(RunOptions())
+    base = Order(
+        predictor="none", refiner="paper", pose="off", sod_mm=700, allow_rescale=True
+    ).options(RunOptions())
     assert Order(views=(Path("a"), Path("b"))).options(base) == base
 
 
@@ -155,6 +159,7 @@ BASE = {"views": ["a", "b"]}
         ({"deadline_s": 0}, "deadline_s = 0"),
         ({"deadline_s": True}, "deadline_s = True"),
         ({"strict": 1}, "strict = 1"),
+        ({"allow_rescale": "yes"}, "allow_rescale = 'yes'"),
         ({"out": 1}, "out = 1"),
         ({"extras": ["stl"]}, "extras = 'stl'"),
         ({"extras": "glb"}, "list of names"),
