@@ -13,6 +13,7 @@ from gcar_export.cli.centers import centers_table, robustness
 from gcar_export.cli.evaluate import converge, evaluate
 from gcar_export.cli.gates import gate_table
 from gcar_export.cli.refine import cost_curves, refine_table, sigma_table
+from gcar_export.cli.wrong_scenes import wrong_scenes
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -272,6 +273,7 @@ for _verb in (
     cost_curves,
     sigma_table,
     gate_table,
+    wrong_scenes,
 ):
     main.add_command(_verb)
 
