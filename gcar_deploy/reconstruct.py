@@ -129,12 +129,12 @@ def _reconstructed(
         for stage in (vessels, placed, centers, refined):
             findings += stage.findings
         findings += missed
-        judged = judge(
-            refined.tree, placed.views, findings, options,
-            disagreement=placed.disagreement, evidence=centers.evidence,
-        )  # fmt: skip
         ostia = marked_places(options.ostia, [view.carm for view in placed.views])
         tree = from_inlets(refined.tree, ostia)
+        judged = judge(
+            tree, placed.views, findings, options,
+            disagreement=placed.disagreement, evidence=centers.evidence,
+        )  # fmt: skip
     return Reconstruction(
         quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=placed.views, poses=placed.poses,

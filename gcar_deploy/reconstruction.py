@@ -24,9 +24,9 @@ from gcar_deploy.measure import BranchName, Measured, measured
 from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
-from gcar_deploy.quality import Quality, unexplained
-from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Mask, Volume
+from gcar_deploy.quality import Quality, part_lengths_mm, unexplained
+from gcar_deploy.tree.tree import Branch, Tree, along
+from gcar_deploy.types import Mask, Scalars, Volume
 
 SCHEMA = "gcar-result/1"
 RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or treatment."
@@ -109,6 +109,14 @@ class Reconstruction:
         return tuple(unexplained(self.tree, view, self.options.quality) for view in self.views)
 
     @property
+    def ghost_probability(self) -> tuple[Scalars, ...]:
+        """Per branch (m,) probability that the vessel is not there; NaN where it is not known."""
+        ghosts = self.quality.ghosts
+        if ghosts is None:
+            return tuple(np.full(len(branch), np.nan) for branch in self.tree.branches)
+        return ghosts.points
+
+    @property
     def names(self) -> tuple[BranchName | None, ...]:
         """Name of each branch (LM, LAD, LCx, RCA) with its probability; None: a number only."""
         return self.measured.names
@@ -166,15 +174,11 @@ class Reconstruction:
             "silent_errors": list(silent_errors(self._carms, exact=self._exact)),
             "tree": {
                 "length_mm": self.tree.length_mm,
-                "branches": [
-                    {"branch": number, **_branch(branch, lumen, name)}
-                    for number, (branch, lumen, name) in enumerate(
-                        zip(self.tree.branches, self.measured.lumens, self.names, strict=True),
-                        start=1,
-                    )
-                ],
+                "parts_mm": list(part_lengths_mm(self.tree)),
+                "branches": self._branches(),
                 "bifurcations": self._bifurcations(),
             },
+            "ambiguity": self._ambiguity(),
             "volume": {
                 "center_mm": list(self.grid.center_mm),
                 "size_mm": list(self.grid.size_mm),
@@ -198,12 +202,57 @@ class Reconstruction:
                 reasons[path] = "the branch is too short to state a stenosis"
             if path.endswith(("/name", "/name_confidence")):
                 reasons[path] = f"no name is as probable as {LEAST_CONFIDENCE:g}"
+            if path.endswith(("/ghost_probability", "/ghost_share")):
+                reasons[path] = "known of two views with the predictor that sees both alone"
         if self.model is None:
             reasons["/model"] = "made without a model"
         if self.segmenter is None:
             reasons["/segmenter"] = "no network looked for vessels in the pictures"
         out["reasons"] = reasons
         return out
+
+    def _branches(self) -> list[dict[str, Any]]:
+        ghosts = self.quality.ghosts
+        told = [None] * len(self.tree.branches) if ghosts is None else ghosts.branches.tolist()
+        parts = zip(self.tree.branches, self.measured.lumens, self.names, told, strict=True)
+        return [
+            {"branch": k, **_branch(branch, lumen, name), "ghost_probability": ghost}
+            for k, (branch, lumen, name, ghost) in enumerate(parts, start=1)
+        ]
+
+    def _ambiguity(self) -> dict[str, Any]:
+        """Say how much of the tree other trees would explain nearly as well, and where."""
+        ghosts = self.quality.ghosts
+        return {
+            "ghost_share": None if ghosts is None else ghosts.share,
+            "probable_ghosts": [
+                {
+                    "branch": ghost.branch + 1,
+                    "start_mm": ghost.start_mm,
+                    "end_mm": ghost.end_mm,
+                    "middle_mm": self._place(ghost.branch, 0.5 * (ghost.start_mm + ghost.end_mm)),
+                    "probability": ghost.probability,
+                }
+                for ghost in (() if ghosts is None else ghosts.probable)
+            ],
+            "exchangeable": [
+                {
+                    "branches": [k + 1 for k in pair.branches],
+                    "middles_mm": [
+                        self._place(k, 0.5 * length)
+                        for k, length in zip(pair.branches, pair.lengths_mm, strict=True)
+                    ],
+                    "difference": pair.difference,
+                }
+                for pair in self.quality.exchanges
+            ],
+        }
+
+    def _place(self, branch: int, at_mm: float) -> list[float]:
+        """Point of a branch so far from its inlet, mm LPS."""
+        own = self.tree.branches[branch]
+        place: list[float] = along(own.points_mm, own.arc_mm, np.array(at_mm)).tolist()
+        return place
 
     def _bifurcations(self) -> list[dict[str, Any]]:
         """Nodes where three or more branches meet, with the angle between each two of them."""

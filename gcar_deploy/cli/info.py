@@ -116,7 +116,9 @@ def lines(path: Path, summary: dict[str, Any]) -> list[str]:
     ]
     for view in summary["views"]:
         coverage = "-" if view["coverage"] is None else f"{view['coverage']:.0%}"
-        out.append(f"  view {view['id']} ({view['name']}): {coverage} of the vessels explained")
+        out.append(
+            f"  view {view['id']} ({view['name']}): {coverage} of the vessels seen are explained"
+        )
     out.append(f"  files: {', '.join(summary.get('files', {}))}")
     out.append(f"  {summary['use']}")
     return out

@@ -86,5 +86,7 @@ def summary_lines(result: Any, out_dir: Path) -> list[str]:
     )
     for view in result.quality.views:
         coverage = "-" if view.coverage is None else f"{view.coverage:.0%}"
-        lines.append(f"view {view.view_id} ({view.name}): {coverage} of the vessels explained")
+        lines.append(
+            f"view {view.view_id} ({view.name}): {coverage} of the vessels seen are explained"
+        )
     return lines

@@ -44,13 +44,13 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         An extra is unknown, or needs a library that is not installed.
     """
     check_extras(extras)
-    surface = lumen_surface(result.tree, SURFACE_EDGE_MM)
+    surface, ghosts = lumen_surface(result.tree, SURFACE_EDGE_MM), result.ghost_probability
     makers: dict[str, Callable[[], bytes]] = {
         "volume.nii.gz": lambda: nifti_bytes(result.volume, result.grid),
         "gaussians.npz": lambda: gaussians_npz(result.gaussians),
         "gaussians.ply": lambda: gaussians_ply(result.gaussians),
-        "centerline.vtp": lambda: centerline_vtp(result.tree, result.measured),
-        "centerline.csv": lambda: centerline_csv(result.tree, result.measured),
+        "centerline.vtp": lambda: centerline_vtp(result.tree, result.measured, ghosts),
+        "centerline.csv": lambda: centerline_csv(result.tree, result.measured, ghosts),
         "surface.stl": lambda: stl_bytes(surface),
     }
     if "glb" in extras:
@@ -68,7 +68,7 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
     ]
     drawn = zip(behind, result.views, result.quality.views, strict=True)
     for number, (dimmed, view, judged) in enumerate(drawn, start=1):
-        picture = overlay(dimmed, view, result.tree, judged)
+        picture = overlay(dimmed, view, result.tree, judged, ghosts)
         files[f"overlay_view{number}.png"] = png_bytes(picture)
     summary = result.summary()
     pictures = [dimmed.picture for dimmed in behind]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import colorsys
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -12,9 +13,9 @@ import numpy as np
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.quality import ViewQuality
-from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Array, Image, Mask, Pixels
+from gcar_deploy.quality import PROBABLE, ViewQuality
+from gcar_deploy.tree.tree import Tree, along, polyline_arc
+from gcar_deploy.types import Array, Image, Mask, Pixels, Scalars
 
 #: smaller pictures are enlarged by a whole number until labels are readable
 _MIN_WIDTH = 768
@@ -73,7 +74,13 @@ def backdrop(pixels: Image, missing: Mask) -> Backdrop:
     return Backdrop(picture=canvas, zoom=zoom)
 
 
-def overlay(behind: Backdrop, view: VesselImage, tree: Tree, judged: ViewQuality) -> Array:
+def overlay(
+    behind: Backdrop,
+    view: VesselImage,
+    tree: Tree,
+    judged: ViewQuality,
+    ghosts: Sequence[Scalars] = (),
+) -> Array:
     """Draw the tree over one view.
 
     Parameters
@@ -82,6 +89,7 @@ def overlay(behind: Backdrop, view: VesselImage, tree: Tree, judged: ViewQuality
     view : what was found in the picture, with the C-arm as it was used (pose applied)
     tree : Tree
     judged : ViewQuality, for the label
+    ghosts : per branch (m,) probability that the vessel is not there; probable ghosts are dashed
 
     Returns
     -------
@@ -89,6 +97,11 @@ def overlay(behind: Backdrop, view: VesselImage, tree: Tree, judged: ViewQuality
     """
     canvas, zoom = behind.picture.copy(), behind.zoom
     lines = [_line(branch.points_mm, view.carm, zoom) for branch in tree.branches]
+    doubtful = [
+        _line(branch.points_mm[first:stop], view.carm, zoom)
+        for branch, told in zip(tree.branches, ghosts, strict=bool(ghosts))
+        for first, stop in _runs(told >= PROBABLE)
+    ]
     width = max(2, round(canvas.shape[1] / 500))
     # A dark casing under each line keeps every colour readable on bright vessels.
     for extra, cased in ((2, True), (0, False)):
@@ -97,9 +110,14 @@ def overlay(behind: Backdrop, view: VesselImage, tree: Tree, judged: ViewQuality
                 points = np.rint(line * 2**_SHIFT).astype(np.int32)
                 color = _BLACK if cased else branch_color(number)
                 cv2.polylines(canvas, [points], False, color, width + extra, cv2.LINE_AA, _SHIFT)
+    # Gaps, not a colour: eyes that tell few colours apart see them as well.
+    for line in doubtful:
+        for dash in _gaps(line, 4 * width):
+            points = np.rint(dash * 2**_SHIFT).astype(np.int32)
+            cv2.polylines(canvas, [points], False, _BLACK, width + 1, cv2.LINE_8, _SHIFT)
     _numbers(canvas, lines)
     _labels(canvas, judged)
-    _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom)
+    _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom, bool(doubtful))
     return canvas
 
 
@@ -122,6 +140,21 @@ def _line(points_mm: Array, carm: CArm, zoom: int) -> Pixels:
     pixels, depth = carm.project(points_mm)
     line: Pixels = np.clip((pixels[depth > 1.0] + 0.5) * zoom - 0.5, -16000, 16000)
     return line
+
+
+def _runs(wanted: Mask) -> list[tuple[int, int]]:
+    """First and behind the last point of each run of two or more."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wanted, [0]]))).reshape(-1, 2)
+    return [(first, stop) for first, stop in edges.tolist() if stop - first > 1]
+
+
+def _gaps(line: Pixels, dash: float) -> list[Pixels]:
+    """Every other piece of a line that is cut into pieces of ``dash`` pixels, the second first."""
+    if len(line) < 2:
+        return []
+    arc = polyline_arc(line)
+    starts = np.arange(dash, arc[-1], 2 * dash)
+    return [along(line, arc, np.linspace(a, min(a + dash, arc[-1]), 6)) for a in starts]
 
 
 def _mark(canvas: Array, missing: Mask, zoom: int) -> None:
@@ -152,11 +185,11 @@ def _labels(canvas: Array, judged: ViewQuality) -> None:
     size = max(canvas.shape[1] / 1000, 0.6)
     _text(canvas, f"View {judged.view_id}: {judged.name}", (14, round(34 * size)), size)
     if judged.coverage is not None:
-        text = f"{judged.coverage:.0%} of the vessels explained"
+        text = f"{judged.coverage:.0%} of the vessels seen are explained"
         _text(canvas, text, (14, round(62 * size)), 0.7 * size)
 
 
-def _legend(canvas: Array, pixel_mm: float) -> None:
+def _legend(canvas: Array, pixel_mm: float, dashed: bool) -> None:
     """Scale bar at the bottom left, meaning of the colours at the bottom right."""
     rows, columns = canvas.shape[:2]
     size = max(columns / 1600, 0.5)
@@ -164,7 +197,9 @@ def _legend(canvas: Array, pixel_mm: float) -> None:
     cv2.line(canvas, (x, y), (x + width, y), _BLACK, 6, cv2.LINE_AA)
     cv2.line(canvas, (x, y), (x + width, y), _WHITE, 2, cv2.LINE_AA)
     _text(canvas, f"{_BAR_MM} mm at the isocentre", (x, y - round(20 * size)), size)
-    entries = (("centreline, a colour a branch", branch_color(0)), ("vessel not explained", _RED))
+    entries = [("centreline, a colour a branch", branch_color(0)), ("vessel not explained", _RED)]
+    if dashed:
+        entries.insert(1, ("dashed: probably not there", branch_color(0)))
     step = round(34 * size)
     wide = max(_width(text, size) for text, _ in entries)
     for k, (text, color) in enumerate(entries):
@@ -173,6 +208,8 @@ def _legend(canvas: Array, pixel_mm: float) -> None:
         middle = row - round(9 * size)
         cv2.line(canvas, (left - 44, middle), (left - 12, middle), _BLACK, 6, cv2.LINE_AA)
         cv2.line(canvas, (left - 44, middle), (left - 12, middle), color, 3, cv2.LINE_AA)
+        if text.startswith("dashed"):
+            cv2.line(canvas, (left - 33, middle), (left - 23, middle), _BLACK, 4)
         _text(canvas, text, (left, row), size)
 
 

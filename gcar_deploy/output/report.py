@@ -99,7 +99,7 @@ def _figure(number: int, view: Mapping[str, Any], picture: Array, most_bytes: in
     name = html.escape(f"View {view['id']}: {view['name']}")
     source = base64.b64encode(_jpeg(picture, most_bytes)).decode("ascii")
     details = [
-        f"{_share(view['coverage'])} of the vessels explained",
+        f"{_share(view['coverage'])} of the vessels seen are explained",
         f"{_share(view['support'])} of the tree seen",
         f"overlap (Dice) {_number(view['overlap'])}",
         f"mean distance {_number(view['distance_mm'], ' mm')}",
@@ -181,6 +181,7 @@ def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
         "-" if row["stenosis_percent"] is None else f"{row['stenosis_percent']:.0f} %",
         "-" if row["lesion_length_mm"] is None else f"{row['lesion_length_mm']:.1f}",
         _number(row["mean_sigma_mm"]),
+        _share(row["ghost_probability"]),
         *(f"{100 * share:.0f} %" for share in hidden),
     ]
     columns = "".join(f"<td>{cell}</td>" for cell in cells)
@@ -201,6 +202,8 @@ def _facts(summary: Mapping[str, Any]) -> str:
         "view separation": f"{summary['separation_deg']:.0f} deg",
         "branches": str(len(summary["tree"]["branches"])),
         "centreline": f"{summary['tree']['length_mm']:.0f} mm",
+        "connected parts": str(len(summary["tree"]["parts_mm"])),
+        "expected in ghosts": _share(summary["ambiguity"]["ghost_share"]),
         "Gaussians": str(summary["counts"]["gaussians"]),
         "time": f"{summary['seconds']['total']:.1f} s",
     }

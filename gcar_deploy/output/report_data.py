@@ -10,7 +10,7 @@ from gcar_deploy.output.overlay import branch_color
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.types import Scalars
 
-#: numbers in the page, all branches together; a point has seven, and three more a view
+#: numbers in the page, all branches together; a point has eight, and three more a view
 _NUMBERS = 22_000
 #: places in a picture are whole numbers of this share of its size
 PLACES = 4096
@@ -22,12 +22,12 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
     Returns
     -------
     ``branches``: per branch its number, points (mm LPS), arc, radius, reference diameter's half
-    (None near the ends), sigma, per view the place in the picture and the residual (mm, None
-    outside), colour, least diameter and lesion; ``views``: directions of the views, then the best
-    further one; ``longest``: the branch to begin with
+    (None near the ends), sigma, probability of a ghost, per view the place in the picture and the
+    residual (mm, None outside), colour, least diameter and lesion; ``views``: directions of the
+    views, then the best further one; ``longest``: the branch to begin with
     """
     points = len(result.tree.points())
-    stride = max(1, -(-points * (7 + 3 * len(result.views)) // _NUMBERS))
+    stride = max(1, -(-points * (8 + 3 * len(result.views)) // _NUMBERS))
     lengths = [branch.length_mm for branch in result.tree.branches]
     carms = [view.carm for view in result.views]
     views = [[carm.primary_angle_deg, carm.secondary_angle_deg] for carm in carms]
@@ -63,6 +63,7 @@ def _branch(result: Reconstruction, k: int, stride: int) -> dict[str, Any]:
         "radius": np.round(branch.radius_mm[keep], 2).tolist(),
         "reference": _known(lumen.healthy_mm[keep] / 2, 2),
         "sigma": _known(branch.sigma_mm[keep], 2),
+        "ghost": _known(result.ghost_probability[k][keep], 2),
         "seen": seen,
         "name": None if name is None else name.name,
         "color": f"rgb({red},{green},{blue})",

@@ -13,7 +13,7 @@ from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.measure import Measured
 from gcar_deploy.output.vtp import poly_data
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Array
+from gcar_deploy.types import Array, Scalars
 
 #: zeroth spherical harmonic, of the 3DGS convention's colour f_dc
 _SH0 = 0.28209479177387814
@@ -76,10 +76,11 @@ def gaussians_ply(gaussians: Gaussians) -> bytes:
     return ("\n".join(header) + "\n").encode("ascii") + columns.astype("<f4").tobytes()
 
 
-def centerline_vtp(tree: Tree, measured: Measured) -> bytes:
+def centerline_vtp(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) -> bytes:
     """XML PolyData, one polyline per branch, mm LPS, for VMTK and 3D Slicer.
 
-    A branch without a name has an empty ``VesselName`` and no (NaN) ``NameConfidence``.
+    A branch without a name has an empty ``VesselName`` and no (NaN) ``NameConfidence``. ``ghosts``
+    are per branch (m,) probabilities that the vessel is not there, NaN where they are not known.
     """
     sizes = [len(branch) for branch in tree.branches]
     radius = tree.radii()
@@ -88,6 +89,7 @@ def centerline_vtp(tree: Tree, measured: Measured) -> bytes:
         "Radius": radius,
         "Sigma": _of_points(tree, "sigma_mm"),
         "Confidence": _of_points(tree, "confidence"),
+        "GhostProbability": np.concatenate([np.zeros(0), *ghosts]),
     }
     cell_data: dict[str, Array | Sequence[str]] = {
         "BranchId": np.arange(1, len(sizes) + 1, dtype=np.int64),
@@ -105,23 +107,25 @@ def centerline_vtp(tree: Tree, measured: Measured) -> bytes:
     return poly_data(tree.points(), sizes, point_data, cell_data)
 
 
-def centerline_csv(tree: Tree, measured: Measured) -> bytes:
-    """One row per centreline point; an unknown sigma or name is an empty field.
+def centerline_csv(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) -> bytes:
+    """One row per centreline point; an unknown sigma, ghost or name is an empty field.
 
-    Branches are numbered from 1, as in the pictures, the report and ``centerline.vtp``.
+    Branches are numbered from 1, as in the pictures, the report and ``centerline.vtp``. ``ghosts``
+    as there.
     """
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     columns_of_points = ["arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
-    writer.writerow(["branch", "point", *columns_of_points, "name", "name_confidence"])
-    told = _told(measured)
-    for number, (branch, (name, share)) in enumerate(zip(tree.branches, told, strict=True), 1):
+    last = ["name", "name_confidence", "ghost_probability"]
+    writer.writerow(["branch", "point", *columns_of_points, *last])
+    told = zip(tree.branches, _told(measured), ghosts, strict=True)
+    for number, (branch, (name, share), ghost) in enumerate(told, 1):
         columns = np.column_stack(
             [branch.arc_mm, branch.points_mm, branch.radius_mm, branch.sigma_mm, branch.confidence]
         )
         for point, row in enumerate(columns):
             fields = [_field(value) for value in row]
-            writer.writerow([number, point, *fields, name, _field(share)])
+            writer.writerow([number, point, *fields, name, _field(share), _field(ghost[point])])
     return stream.getvalue().encode("ascii")
 
 

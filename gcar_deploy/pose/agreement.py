@@ -14,7 +14,7 @@ from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
-from gcar_deploy.quality import check_order, disagreement_limits
+from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
 
@@ -133,8 +133,8 @@ def order_of(
     if len(views) != 2:
         return [], ""
     first, second = views
-    calibrated, given = first.calibrated and second.calibrated, poses[1].after
-    if calibrated and given <= disagreement_limits(calibrated, options.quality)[0]:
+    kind, given = kind_of(views), poses[1].after
+    if kind == "exact" and given <= disagreement_limits(kind, options.quality)[0]:
         return [], ""  # nothing to be asked, and no time spent on it
     ids, other = (first.view_id, second.view_id), other_order(views, options)
-    return check_order(ids, given, other, calibrated, options.quality)
+    return check_order(ids, given, other, kind, options.quality)

@@ -1,6 +1,7 @@
 """Quality: whether a tree can honestly be made, and how far to trust it."""
 
 from gcar_deploy.quality.gates import (
+    check_agreement,
     check_candidates,
     check_consistency,
     check_order,
@@ -8,21 +9,49 @@ from gcar_deploy.quality.gates import (
     check_tree,
     check_views,
     disagreement_limits,
+    kind_of,
     with_hint,
 )
-from gcar_deploy.quality.status import Quality, ViewQuality, judge, unexplained
+from gcar_deploy.quality.ghost_figures import FIGURES
+from gcar_deploy.quality.ghosts import (
+    GHOST_MM,
+    PROBABLE,
+    GhostModel,
+    Ghosts,
+    ghost_share,
+    shipped_model,
+)
+from gcar_deploy.quality.status import (
+    Quality,
+    ViewQuality,
+    check_explained,
+    judge,
+    part_lengths_mm,
+    unexplained,
+)
 
 __all__ = [
+    "FIGURES",
+    "GHOST_MM",
+    "PROBABLE",
+    "GhostModel",
+    "Ghosts",
     "Quality",
     "ViewQuality",
+    "check_agreement",
     "check_candidates",
     "check_consistency",
+    "check_explained",
     "check_order",
     "check_poses",
     "check_tree",
     "check_views",
     "disagreement_limits",
+    "ghost_share",
     "judge",
+    "kind_of",
+    "part_lengths_mm",
+    "shipped_model",
     "unexplained",
     "with_hint",
 ]

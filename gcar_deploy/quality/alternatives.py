@@ -40,10 +40,12 @@ class Exchange:
 
     Attributes
     ----------
+    branches : numbers of both in the tree, from 0
     lengths_mm : of both
     difference : share of their mass per epipolar plane that differs, 0 (equal) .. 1
     """
 
+    branches: tuple[int, int]
     lengths_mm: tuple[float, float]
     difference: float
 
@@ -53,10 +55,12 @@ def findings(alternatives: Sequence[Exchange], elsewhere: float | None) -> list[
     out = []
     if alternatives:
         a, b = alternatives[0].lengths_mm
+        first, second = alternatives[0].branches
         more = f" (and {len(alternatives) - 1} more pairs)" if len(alternatives) > 1 else ""
         out.append(
-            f"two vessels of {a:.0f} and {b:.0f} mm could be exchanged between the views without "
-            f"a trace in the pictures{more}: they may lie elsewhere; a third view would tell"
+            f"two vessels of {a:.0f} and {b:.0f} mm (branches {first + 1} and {second + 1}) could "
+            f"be exchanged between the views without a trace in the pictures{more}: they may lie "
+            "elsewhere; a third view would tell"
         )
     if elsewhere is not None and elsewhere > MOST_ELSEWHERE:
         out.append(
@@ -78,13 +82,13 @@ def exchanges(tree: Tree, carms: Sequence[CArm]) -> tuple[Exchange, ...]:
         return ()
     degrees = tree.degrees
     loose = [
-        b
-        for b in tree.branches
+        number
+        for number, b in enumerate(tree.branches)
         if min(degrees[b.start], degrees[b.end]) == 1 and b.length_mm >= MIN_LENGTH_MM
     ]
     if len(loose) < 2:
         return ()
-    planes = [_masses(branch, carms) for branch in loose]
+    planes = [_masses(tree.branches[number], carms) for number in loose]
     low = min(at.min() for at, _ in planes) - 2 * BIN_MM
     high = max(at.max() for at, _ in planes) + 2 * BIN_MM
     profiles = [_profile(at, mass, low, high) for at, mass in planes]
@@ -93,8 +97,9 @@ def exchanges(tree: Tree, carms: Sequence[CArm]) -> tuple[Exchange, ...]:
         whole = float(profiles[a].sum() + profiles[b].sum())
         difference = float(np.abs(profiles[a] - profiles[b]).sum()) / max(whole, 1e-9)
         if difference < MOST_DIFFERENCE:
-            lengths = (loose[a].length_mm, loose[b].length_mm)
-            found.append(Exchange(lengths_mm=lengths, difference=difference))
+            pair = loose[a], loose[b]
+            lengths = (tree.branches[pair[0]].length_mm, tree.branches[pair[1]].length_mm)
+            found.append(Exchange(branches=pair, lengths_mm=lengths, difference=difference))
     return tuple(found)
 
 

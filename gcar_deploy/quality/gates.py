@@ -52,11 +52,20 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
     return []
 
 
-def disagreement_limits(calibrated: bool, options: QualityOptions) -> tuple[float, float]:
-    """Disagreement above which views are doubted, and above which they are refused."""
-    if calibrated:
-        return options.good_disagreement, options.max_disagreement
-    return options.good_disagreement_raw, options.max_disagreement_raw
+def kind_of(views: Sequence[VesselImage]) -> str:
+    """Return what views that are judged together are: ``exact``, ``mask`` or, any of them, raw."""
+    if all(view.calibrated for view in views):
+        return "exact"
+    return "mask" if all(view.calibrated or view.kind == "mask" for view in views) else "raw"
+
+
+def disagreement_limits(kind: str, options: QualityOptions) -> tuple[float, float]:
+    """Disagreement above which views of a kind are doubted, and above which they are refused."""
+    return {
+        "exact": (options.good_disagreement, options.max_disagreement),
+        "mask": (options.good_disagreement_mask, options.max_disagreement_mask),
+        "raw": (options.good_disagreement_raw, options.max_disagreement_raw),
+    }[kind]
 
 
 def check_consistency(
@@ -81,24 +90,24 @@ def check_consistency(
     findings = []
     for k, (view, value) in enumerate(zip(views, disagreement, strict=True)):
         other = views[partners[k] if partners else 0]
-        calibrated = other.calibrated and view.calibrated
-        findings += check_agreement((other.view_id, view.view_id), value, calibrated, options)
+        kind = kind_of((other, view))
+        findings += check_agreement((other.view_id, view.view_id), value, kind, options)
     return findings
 
 
 def check_agreement(
-    view_ids: tuple[str, str], disagreement: float, calibrated: bool, options: QualityOptions
+    view_ids: tuple[str, str], disagreement: float, kind: str, options: QualityOptions
 ) -> list[str]:
     """Judge the disagreement of two views, 0 .. 1; returns and raises as ``check_consistency``."""
     first, second = view_ids
-    good, most = disagreement_limits(calibrated, options)
+    good, most = disagreement_limits(kind, options)
     if disagreement > most:
         raise RefusedError(
             f"views {first} and {second} contradict each other: the vessels "
             f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
             "different patients, frames or angles?"
         )
-    if disagreement > (good if calibrated else min(good, options.sure_disagreement_raw)):
+    if disagreement > (min(good, options.sure_disagreement_raw) if kind == "raw" else good):
         return [
             f"view {second} agrees poorly with view {first}: {disagreement:.0%} of "
             "the vessel differs along the epipolar lines"
@@ -110,7 +119,7 @@ def check_order(
     view_ids: tuple[str, str],
     disagreement: float,
     other_order: float | None,
-    calibrated: bool,
+    kind: str,
     options: QualityOptions,
 ) -> tuple[list[str], str]:
     """Judge whether two pictures could have been given in the wrong order.
@@ -120,16 +129,16 @@ def check_order(
     view_ids : of both views
     disagreement : of the pictures as they were given, corrected, 0 .. 1
     other_order : with each other's geometry as it is told; None where they cannot be swapped
-    calibrated : whether both pictures are
+    kind : of the pictures, see ``kind_of``
 
     Returns
     -------
     findings : that make the result ``degraded``
     hint : what a refusal should say as well; empty where the pictures need not be swapped
     """
-    good, _ = disagreement_limits(calibrated, options)
+    good, _ = disagreement_limits(kind, options)
     # Opposite views are not compared, which leaves 0.
-    if other_order is None or disagreement <= (good if calibrated else 0.0):
+    if other_order is None or disagreement <= (good if kind == "exact" else 0.0):
         return [], ""
     first, second = view_ids
     instead = (
@@ -138,7 +147,8 @@ def check_order(
     if other_order <= min(good, options.swapped_ratio * disagreement):
         hint = f"views {first} and {second} agree far better {instead}: are the pictures swapped?"
         return [hint], hint
-    if other_order <= options.order_ratio * disagreement:
+    ratio = options.order_ratio_mask if kind == "mask" else options.order_ratio
+    if other_order <= ratio * disagreement:
         return [
             f"views {first} and {second} agree about as well {instead}: the pictures do not tell "
             "whether they are swapped"

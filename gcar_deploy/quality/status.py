@@ -17,7 +17,8 @@ from gcar_deploy.imaging.extract import PATH_THRESHOLD_PIXELS
 from gcar_deploy.measure.lumen import hidden_share
 from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
-from gcar_deploy.quality.gates import best_separation, disagreement_limits
+from gcar_deploy.quality.gates import best_separation, disagreement_limits, kind_of
+from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.human_range import check_human_range
 from gcar_deploy.quality.scale import check_scale
 from gcar_deploy.tree.tree import Tree
@@ -25,6 +26,15 @@ from gcar_deploy.tubes import footprint, tubes_of
 from gcar_deploy.types import Array, Mask, Scalars
 
 OK, DEGRADED, REFUSED = "ok", "degraded", "refused"
+#: what ``ok`` rests on, and what no result of few views can rest on
+_CHECKED = (
+    "Checked: agreement and order of the views, what they show of the tree and it of them, its "
+    "size, exchangeable vessels and probable ghosts."
+)
+_UNSEEN = (
+    "Views cannot check a shift or turn within the plane of their beams, nor vessel that no "
+    "picture shows."
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,6 +81,7 @@ class Quality:
     disagreement : worst epipolar disagreement of any view with the first, or None
     views : one ViewQuality per view
     exchanges : vessels that the pictures would let change partners
+    ghosts : what is known of ghosts in the tree; None where nothing is
     """
 
     status: str
@@ -80,6 +91,7 @@ class Quality:
     disagreement: float | None
     views: tuple[ViewQuality, ...]
     exchanges: tuple[alternatives.Exchange, ...] = ()
+    ghosts: Ghosts | None = None
 
 
 def judge(
@@ -111,13 +123,14 @@ def judge(
     elsewhere = None if evidence is None else alternatives.evidence_elsewhere(
         tree, evidence.points, evidence.ray, evidence.weight
     )  # fmt: skip
+    ghosts = find_ghosts(tree, views, evidence)
     findings = [
         *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
-        *check_human_range(tree),
+        *check_human_range(tree), *check_ghosts(ghosts, options.quality),
     ]  # fmt: skip
     lumen = [_lumen(tree, v.carm) for v in views]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)
-    return dataclasses.replace(judged, exchanges=open_)
+    return dataclasses.replace(judged, exchanges=open_, ghosts=ghosts)
 
 
 def _lumen(tree: Tree, carm: CArm) -> Mask:
@@ -154,11 +167,10 @@ def assess(
         view_quality(tree, view, inside, options, _across(view, views))
         for view, inside in zip(views, lumen, strict=True)
     ]
-    calibrated = all(view.calibrated for view in views)
-    findings = [*findings, *check_explained(judged, disagreement, calibrated, options)]
+    findings = [*findings, *check_explained(judged, disagreement, kind_of(views), options)]
     return Quality(
         status=DEGRADED if findings else OK,
-        sentence=_sentence(findings, len(views)),
+        sentence=_sentence(findings, tree, len(views)),
         findings=tuple(findings),
         separation_deg=best_separation([view.carm for view in views]),
         disagreement=disagreement,
@@ -169,7 +181,7 @@ def assess(
 def check_explained(
     views: Sequence[ViewQuality],
     disagreement: float | None,
-    calibrated: bool,
+    kind: str,
     options: QualityOptions,
 ) -> list[str]:
     """Judge how much of the pictures a tree explains, and how much of it they show.
@@ -178,7 +190,7 @@ def check_explained(
     ----------
     views : what the comparison of each picture with the tree gave
     disagreement : worst epipolar disagreement, None if it was not measured
-    calibrated : whether all pictures are
+    kind : of the pictures, see ``kind_of``
 
     Raises
     ------
@@ -186,7 +198,7 @@ def check_explained(
         As for ``assess``.
     """
     findings = []
-    doubtful = (disagreement or 0.0) > disagreement_limits(calibrated, options)[0]
+    doubtful = (disagreement or 0.0) > disagreement_limits(kind, options)[0]
     for one in views:
         if doubtful and (one.coverage or 0.0) < options.good_coverage:
             raise RefusedError(
@@ -196,7 +208,7 @@ def check_explained(
             )
         for value, least, good, what in (
             (one.coverage, options.min_coverage, options.good_coverage,
-             "of the picture's vessels are explained by the tree"),
+             "of the vessels seen in the picture are explained by the tree"),
             (one.support, options.min_support, options.good_support,
              "of the tree lies on the picture's vessels"),
         ):  # fmt: skip
@@ -208,12 +220,28 @@ def check_explained(
     return findings
 
 
-def _sentence(findings: Sequence[str], count: int) -> str:
+def _sentence(findings: Sequence[str], tree: Tree, count: int) -> str:
     if not findings:
-        return f"All {count} views are explained by one tree."
+        return f"All {count} views are explained by one tree{_pieces(tree)}. {_CHECKED} {_UNSEEN}"
     more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
     text = findings[0][0].upper() + findings[0][1:] + more
     return text if text.endswith("?") else f"{text}."
+
+
+def _pieces(tree: Tree) -> str:
+    """Tell disconnected pieces; nothing of a tree that hangs together."""
+    lengths = part_lengths_mm(tree)
+    if len(lengths) < 2:
+        return ""
+    told = ", ".join(f"{length:.0f}" for length in lengths)
+    return f", in {len(lengths)} disconnected pieces of {told} mm"
+
+
+def part_lengths_mm(tree: Tree) -> tuple[float, ...]:
+    """Vessel length in each connected part of a tree, the longest first, mm."""
+    part = tree.components()[[branch.start for branch in tree.branches]]
+    lengths = np.bincount(part, [branch.length_mm for branch in tree.branches])
+    return tuple(sorted(lengths[lengths > 0].tolist(), reverse=True))
 
 
 def _across(view: VesselImage, views: Sequence[VesselImage]) -> VesselImage | None:

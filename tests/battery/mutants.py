@@ -242,7 +242,7 @@ MUTANTS = (
     Mutant(
         "views: pictures in the wrong order are not noticed",
         "gcar_deploy/pose/agreement.py",
-        "    return check_order(ids, given, other, calibrated, options.quality)",
+        "    return check_order(ids, given, other, kind, options.quality)",
         '    return [], ""',
         ("tests/hard/test_matrix.py::test_swapped_pictures_are_asked_for_by_name",),
     ),

@@ -159,7 +159,7 @@ def test_an_empty_tree_is_a_valid_file(result, tmp_path):
     from gcar_deploy.tree.tree import empty_tree
 
     file = tmp_path / "empty.vtp"
-    file.write_bytes(centerline_vtp(empty_tree(), measured(empty_tree(), result.views)))
+    file.write_bytes(centerline_vtp(empty_tree(), measured(empty_tree(), result.views), ()))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))
     reader.Update()

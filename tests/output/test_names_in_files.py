@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 from importlib import resources
@@ -15,13 +14,14 @@ from gcar_deploy.cli.info import names_of
 from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.report_data import scene_data
 from tests.measure.test_naming import left_tree
+from tests.output.made_results import with_tree
 
 NAMES = ["LM", "LAD", "LCx", "LAD", None]
 
 
 @pytest.fixture(scope="module")
 def named(result):
-    return dataclasses.replace(result, tree=left_tree())
+    return with_tree(result, left_tree())
 
 
 @pytest.fixture(scope="module")

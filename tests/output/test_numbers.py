@@ -14,6 +14,7 @@ import pytest
 from gcar_deploy.measure.inlet import from_inlets
 from gcar_deploy.output.bundle import render_files
 from tests.measure.test_naming import left_tree
+from tests.output.made_results import with_tree
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def files(result):
     narrowed = dataclasses.replace(thin, radius_mm=radius)
     branches = (*tree.branches[:3], narrowed, tree.branches[4])
     tree = from_inlets(dataclasses.replace(tree, branches=branches))
-    return render_files(dataclasses.replace(result, tree=tree))
+    return render_files(with_tree(result, tree))
 
 
 @pytest.fixture(scope="module")

@@ -110,3 +110,23 @@ def test_colours_differ_and_leave_red_alone():
     gap = np.abs(colors[:, None] - colors[None]).max(axis=2)[~np.eye(12, dtype=bool)]
     assert gap.min() > 15
     assert np.linalg.norm(colors - RED, axis=1).min() > 90
+
+
+def test_a_probable_ghost_is_dashed_and_told_in_the_legend():
+    view = blank_view()
+    tree = line_tree(view.carm)
+    behind = backdrop(np.zeros((view.carm.rows, view.carm.columns), np.float32), view.mask)
+    ghost = np.where(np.arange(60) < 30, 0.9, 0.1)
+    plain, dashed = (overlay(behind, view, tree, JUDGED, told) for told in ((), (ghost,)))
+    zoom = plain.shape[1] // view.carm.columns
+    row = round(60.5 * zoom)
+
+    def coloured(picture, first, last):
+        line = picture[row - 1 : row + 2, round(first * zoom) : round(last * zoom)]
+        return (line == branch_color(0)).all(axis=2).any(axis=0)
+
+    assert coloured(plain, 22, 44).all()
+    assert 0.3 < coloured(dashed, 22, 44).mean() < 0.7
+    assert coloured(dashed, 47, 69).all()  # the other half is whole
+    bottom = plain.shape[0] // 2
+    assert (plain[bottom:] != dashed[bottom:]).any()

@@ -15,6 +15,7 @@ from gcar_deploy.output.report import _jpeg, report_html
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.tables import centerline_csv, centerline_vtp, gaussians_npz, gaussians_ply
 from gcar_deploy.tree.tree import Branch, Tree
+from tests.output.made_results import with_ghost, with_tree
 
 
 def some_gaussians(n, sigma=None):
@@ -49,7 +50,7 @@ def test_vtp_cells(result, tmp_path):
     from vtk.util.numpy_support import vtk_to_numpy
 
     file = tmp_path / "line.vtp"
-    file.write_bytes(centerline_vtp(result.tree, result.measured))
+    file.write_bytes(centerline_vtp(result.tree, result.measured, result.ghost_probability))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))
     reader.Update()
@@ -69,7 +70,8 @@ def test_csv_numbers_arcs_and_unknown_sigma(result):
     tree = result.tree
     hidden = dataclasses.replace(tree.branches[0], sigma_mm=np.full(len(tree.branches[0]), np.nan))
     tree = dataclasses.replace(tree, branches=(hidden, *tree.branches[1:]))
-    rows = list(csv.DictReader(io.StringIO(centerline_csv(tree, result.measured).decode("ascii"))))
+    told = result.measured, result.ghost_probability
+    rows = list(csv.DictReader(io.StringIO(centerline_csv(tree, *told).decode("ascii"))))
     assert [int(row["branch"]) for row in rows] == list(tree.branch_index() + 1)
     assert {row["sigma_mm"] for row in rows if row["branch"] == "1"} == {""}
     last = [row for row in rows if row["branch"] == "1"][-1]
@@ -77,7 +79,7 @@ def test_csv_numbers_arcs_and_unknown_sigma(result):
 
 
 def test_table_and_json_state_the_trees_own_numbers(result):
-    written = centerline_csv(result.tree, result.measured).decode("ascii")
+    written = centerline_csv(result.tree, result.measured, result.ghost_probability).decode("ascii")
     rows = list(csv.DictReader(io.StringIO(written)))
     own = {
         "radius_mm": result.tree.radii(),
@@ -91,6 +93,33 @@ def test_table_and_json_state_the_trees_own_numbers(result):
         result.tree.branches, result.summary()["tree"]["branches"], strict=True
     ):
         assert told["mean_sigma_mm"] == pytest.approx(branch.sigma_mm.mean())
+
+
+def test_probabilities_of_a_ghost_are_in_table_and_json(result):
+    doubted = with_ghost(result)
+    written = centerline_csv(doubted.tree, doubted.measured, doubted.ghost_probability)
+    rows = list(csv.DictReader(io.StringIO(written.decode("ascii"))))
+    expected = np.concatenate(doubted.ghost_probability)
+    np.testing.assert_allclose([float(row["ghost_probability"]) for row in rows], expected)
+    summary = doubted.summary()
+    told = [branch["ghost_probability"] for branch in summary["tree"]["branches"]]
+    assert told == pytest.approx(doubted.quality.ghosts.branches)
+    (ghost,) = summary["ambiguity"]["probable_ghosts"]
+    branch = doubted.tree.branches[ghost["branch"] - 1]
+    assert ghost["end_mm"] == pytest.approx(0.5 * branch.length_mm)
+    gap = np.linalg.norm(branch.points_mm - ghost["middle_mm"], axis=1)
+    assert abs(branch.arc_mm[gap.argmin()] - 0.25 * branch.length_mm) < 2.0
+    assert summary["ambiguity"]["ghost_share"] == 0.2
+
+
+def test_unknown_ghosts_are_empty_fields_and_null_with_a_reason(result):
+    written = centerline_csv(result.tree, result.measured, result.ghost_probability)
+    rows = list(csv.DictReader(io.StringIO(written.decode("ascii"))))
+    assert {row["ghost_probability"] for row in rows} == {""}
+    summary = result.summary()
+    assert summary["tree"]["branches"][0]["ghost_probability"] is None
+    assert "two views" in summary["reasons"]["/tree/branches/0/ghost_probability"]
+    assert summary["tree"]["parts_mm"][0] <= summary["tree"]["length_mm"]
 
 
 def long_tree(branches=40, points=400):
@@ -108,7 +137,7 @@ def long_tree(branches=40, points=400):
 
 def test_report_stays_small_for_noisy_pictures_and_long_trees(result):
     tree = long_tree()
-    long = dataclasses.replace(result, tree=tree)
+    long = with_tree(result, tree)
     noise = np.random.default_rng(0).normal(120, 12, (512, 512)).clip(0, 255).astype(np.uint8)
     picture = np.repeat(np.kron(noise, np.ones((2, 2), np.uint8))[..., None], 3, axis=2)
     assert len(report_html(long, long.summary(), [picture, picture])) < 500_000
@@ -137,14 +166,14 @@ def test_lumen_figures_are_in_the_summary_and_in_the_vtp(result, tmp_path):
         sigma_mm=np.full(81, 0.1), confidence=np.ones(81), start=0, end=1,
     )  # fmt: skip
     tree = Tree(nodes_mm=narrow.points_mm[[0, -1]], branches=(narrow,))
-    narrowed = dataclasses.replace(result, tree=tree)
+    narrowed = with_tree(result, tree)
     row = narrowed.summary()["tree"]["branches"][0]
     assert row["minimal_diameter_mm"] == pytest.approx(1.5, abs=1e-6)
     assert row["minimal_at_mm"] == pytest.approx(20.0)
     assert row["stenosis_percent"] == pytest.approx(50.0, abs=2.0)
     assert row["lesion_length_mm"] == pytest.approx(2 * 2.5 * np.sqrt(2 * np.log(2)), abs=1.0)
     file = tmp_path / "line.vtp"
-    file.write_bytes(centerline_vtp(tree, narrowed.measured))
+    file.write_bytes(centerline_vtp(tree, narrowed.measured, narrowed.ghost_probability))
     reader = vtk.vtkXMLPolyDataReader()
     reader.SetFileName(str(file))
     reader.Update()
@@ -163,7 +192,7 @@ def test_a_fork_tells_its_angles_and_a_short_branch_why_it_says_nothing(result):
     lines = [branch([[-20, 0, 0], [0, 0, 0]], 1.5), branch([[0, 0, 0], [20, 0, 0]], 1.5, 1, 2)]
     nodes = np.array([[-20, 0, 0], [0, 0, 0], [20, 0, 0], [0, 0, 1.0]])
     tree = Tree(nodes_mm=nodes, branches=(*lines, stub))
-    summary = dataclasses.replace(result, tree=tree).summary()
+    summary = with_tree(result, tree).summary()
     (node,) = summary["tree"]["bifurcations"]
     assert node["node"] == 1 and node["position_mm"] == [0, 0, 0]
     found = {tuple(a["branches"]): a["angle_deg"] for a in node["angles"]}

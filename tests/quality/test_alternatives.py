@@ -14,7 +14,8 @@ def test_parallel_bars_of_one_width_can_be_exchanged():
     found = exchanges(bars(3), VIEWS)
     assert len(found) == 3 and max(e.difference for e in found) < 0.15
     (sentence,) = findings(found, None)
-    assert "40 and 40 mm" in sentence and "2 more pairs" in sentence
+    assert found[0].branches == (0, 1)
+    assert "40 and 40 mm (branches 1 and 2)" in sentence and "2 more pairs" in sentence
 
 
 def test_a_third_view_a_single_vessel_and_a_tree_leave_nothing_open():

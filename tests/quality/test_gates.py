@@ -18,6 +18,7 @@ from gcar_deploy.quality.gates import (
     check_poses,
     check_tree,
     check_views,
+    kind_of,
     with_hint,
 )
 from gcar_deploy.selftest import tiny_case
@@ -76,23 +77,38 @@ def test_contradiction(case):
         check_consistency(views, [0.0, OPTIONS.max_disagreement + 0.01], OPTIONS)
 
 
-RAW, EXACT = False, True
-#: (calibrated, disagreement, with the pictures exchanged) -> what is said of their order
+RAW, EXACT, MASK = "raw", "exact", "mask"
+#: (kind of pictures, disagreement, with the pictures exchanged) -> what is said of their order
 ORDERS = [
     (RAW, 0.12, 0.07, "swapped"), (RAW, 0.12, 0.12, "do not tell"),
     (RAW, 0.12, 0.14, "do not tell"), (RAW, 0.12, 0.15, ""),
     (RAW, 0.4, 0.25, "do not tell"), (RAW, 0.12, None, ""), (RAW, 0.0, 0.0, ""),
     (EXACT, 0.14, 0.001, "swapped"), (EXACT, 0.001, 0.0001, ""), (EXACT, 0.3, 0.2, "do not tell"),
-    (EXACT, 0.07, 0.15, ""),
+    (EXACT, 0.07, 0.15, ""), (MASK, 0.17, 0.21, ""), (MASK, 0.17, 0.16, "do not tell"),
+    (MASK, 0.17, 0.12, "swapped"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("calibrated", "given", "other", "said"), ORDERS)
-def test_pictures_in_the_wrong_order(calibrated, given, other, said):
-    findings, hint = check_order(("a", "b"), given, other, calibrated, OPTIONS)
+@pytest.mark.parametrize(("kind", "given", "other", "said"), ORDERS)
+def test_pictures_in_the_wrong_order(kind, given, other, said):
+    findings, hint = check_order(("a", "b"), given, other, kind, OPTIONS)
     assert len(findings) == (said != "")
     assert all("views a and b" in text and said in text for text in findings)
     assert hint == (findings[0] if said == "swapped" else "")
+
+
+def test_masks_are_judged_by_gates_of_their_own(case):
+    """Right pairs of masks differ by 12-17 % along the epipolar lines, more than raw ones may."""
+    exact = case[1]
+    masks = [dataclasses.replace(v, kind="mask", path_error=0.2) for v in exact]
+    raw = [dataclasses.replace(v, kind="raw", path_error=0.3) for v in exact]
+    assert [kind_of(v) for v in (exact, masks, raw)] == [EXACT, MASK, RAW]
+    assert kind_of([exact[0], masks[1]]) == MASK and kind_of([masks[0], raw[1]]) == RAW
+    assert check_consistency(masks, [0.0, 0.17], OPTIONS) == []
+    assert check_consistency(raw, [0.0, 0.17], OPTIONS)
+    assert check_consistency(masks, [0.0, OPTIONS.good_disagreement_mask + 0.01], OPTIONS)
+    with pytest.raises(RefusedError, match="contradict"):
+        check_consistency(masks, [0.0, OPTIONS.max_disagreement_mask + 0.01], OPTIONS)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from gcar_deploy.config import ImagingOptions, QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.quality.status import assess, view_quality
+from gcar_deploy.quality.status import assess, part_lengths_mm, view_quality
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree, empty_tree
 
@@ -80,3 +80,23 @@ def test_match_rate_and_strict_coverage(case):
     assert quality.match_rate > 0.97 and 0.0 < quality.foreshortening < 0.5
     assert quality.coverage_2px <= quality.coverage
     assert view_quality(tree, views[0], views[0].mask, OPTIONS).match_rate is None
+
+
+def test_ok_says_what_was_checked_what_was_not_and_how_many_pieces(case):
+    _, views, tree = case
+    lumen = [v.mask for v in views]
+    whole = assess(tree, views, lumen, [], 0.01, OPTIONS).sentence
+    assert "explained by one tree." in whole and "Checked:" in whole and "cannot check" in whole
+    first, *others = tree.branches
+    ends = np.arange(2) + len(tree.nodes_mm)
+    loose = dataclasses.replace(first, start=int(ends[0]), end=int(ends[1]))
+    torn = Tree(
+        nodes_mm=np.concatenate([tree.nodes_mm, first.points_mm[[0, -1]]]),
+        branches=(loose, *others),
+    )
+    lengths = part_lengths_mm(torn)
+    assert len(lengths) > 1 and sum(lengths) == pytest.approx(tree.length_mm)
+    assert lengths == tuple(sorted(lengths, reverse=True))
+    told = assess(torn, views, lumen, [], 0.01, OPTIONS)
+    assert told.status == "ok" and f"{len(lengths)} disconnected pieces of" in told.sentence
+    assert part_lengths_mm(empty_tree()) == ()
