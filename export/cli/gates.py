@@ -1,25 +1,74 @@
-"""``gcar-export gate-table``: parse, call, print."""
+"""``gcar-export gate-table``, ``ghost-fit`` and ``status-table``: parse, call, print."""
 
 from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from gcar_export.cli.evaluate import words
 
+if TYPE_CHECKING:
+    from gcar_export.studies.gate_rows import Row
+
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+#: what all three commands ask: they read and add to the same rows
+_SHARED = (
+    click.option("--data", type=_FOLDER, help="Folder with label volumes: look at these as well."),
+    click.option("--cases", default="", help="Only these of them, comma-separated."),
+    click.option("--out", type=click.Path(path_type=Path), required=True,
+                 help="Rows, tables, pictures; may hold those of an earlier run."),
+)  # fmt: skip
+
+
+def _shared(command: Any) -> Any:
+    for option in reversed(_SHARED):
+        command = option(command)
+    return command
+
+
+def _measured(
+    out: Path, seeds: Sequence[tuple[int, int]], files: Sequence[Path], kinds: Sequence[str]
+) -> list[list[Row]]:
+    """Rows of each (seed, trees), then of the label volumes."""
+    from gcar_export.studies import gate_rows
+    from gcar_export.studies.gate_pairs import OFF, PICTURES, real_subject
+
+    out.mkdir(parents=True, exist_ok=True)
+    real_kinds = [kind for kind in kinds if kind not in OFF]
+    makers = [functools.partial(real_subject, file) for file in files]
+    total = sum(trees for _, trees in seeds) * len(kinds) + len(makers) * len(real_kinds)
+    rows = out / "rows.jsonl"
+    with click.progressbar(length=total * len(PICTURES), label="pairs", file=sys.stderr) as bar:
+        step = functools.partial(bar.update, 1)
+        found = [gate_rows.measure(rows, seed, trees, step, kinds) for seed, trees in seeds]
+        enough = len(makers) > 1
+        found.append(gate_rows.measure_real(rows, makers, real_kinds, step) if enough else [])
+    return found
+
+
+def _labels(data: Path | None, cases: str) -> list[Path]:
+    from gcar_export.evaluate.evaluate import find_labels
+
+    files = find_labels(data) if data else []
+    return [f for f in files if not cases or f.name.split(".")[0] in words(cases)]
+
+
+def _say(parts: Sequence[str], file: Path) -> None:
+    text = "\n\n".join(parts)
+    file.write_text(text + "\n", encoding="utf-8")
+    click.echo(text)
 
 
 @click.command("gate-table")
 @click.option("--trees", default=24, show_default=True, help="Generated trees per seed.")
 @click.option("--seed", default=50_001, show_default=True, help="Population to choose gates on.")
 @click.option("--check-seed", default=50_002, show_default=True, help="Population to check on.")
-@click.option("--data", type=_FOLDER, help="Folder with label volumes: look at these as well.")
-@click.option("--cases", default="", help="Only these of them, comma-separated.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows, table, PNG.")
+@_shared
 def gate_table(
     trees: int, seed: int, check_seed: int, data: Path | None, cases: str, out: Path
 ) -> None:
@@ -30,27 +79,12 @@ def gate_table(
     Example: gcar-export gate-table --trees 24 --data data --out gates
     """
     from gcar_deploy.config import QualityOptions
-    from gcar_export.evaluate.evaluate import find_labels
     from gcar_export.studies import gate_report as report
-    from gcar_export.studies import gate_table as study
-    from gcar_export.studies.gate_pairs import KINDS, OFF, PICTURES, real_subject
+    from gcar_export.studies.gate_pairs import KINDS
 
     gates = QualityOptions()
-    files = find_labels(data) if data else []
-    wanted = [f for f in files if not cases or f.name.split(".")[0] in words(cases)]
-    subjects = [functools.partial(real_subject, file) for file in wanted]
-    real_kinds = [kind for kind in KINDS if kind not in OFF]
-    out.mkdir(parents=True, exist_ok=True)
-    rows_file = out / "rows.jsonl"
-    total = 2 * trees * len(KINDS) * len(PICTURES) + len(wanted) * len(real_kinds) * len(PICTURES)
-    with click.progressbar(length=total, label="pairs", file=sys.stderr) as bar:
-        on_pair = functools.partial(bar.update, 1)
-        first, second = (study.measure(rows_file, s, trees, on_pair) for s in (seed, check_seed))
-        real = (
-            study.measure_real(rows_file, subjects, real_kinds, on_pair)
-            if len(subjects) > 1
-            else []
-        )
+    seeds = ((seed, trees), (check_seed, trees))
+    first, second, real = _measured(out, seeds, _labels(data, cases), KINDS)
     parts = [
         f"Seed {seed}, gates as they are:", report.status_table(first, gates),
         f"Seed {check_seed}, gates as they are:", report.status_table(second, gates),
@@ -63,8 +97,48 @@ def gate_table(
     if real:
         parts += ["Label volumes, gates as they are:", report.status_table(real, gates)]
         parts.append(report.doubt_table(real, gates))
-    text = "\n\n".join(parts)
-    (out / "gates.md").write_text(text + "\n", encoding="utf-8")
+    _say(parts, out / "gates.md")
     report.draw([*first, *second], gates, out / "gates.png")
-    click.echo(text)
     click.echo(out / "gates.png")
+
+
+@click.command("ghost-fit")
+@click.option("--trees", default=24, show_default=True, help="Generated trees to fit to.")
+@click.option("--seed", default=60_001, show_default=True, help="Population to fit to.")
+@click.option("--check-trees", default=12, show_default=True, help="Other trees, to check on.")
+@click.option("--check-seed", default=60_002, show_default=True, help="Their population.")
+@click.option("--write", type=click.Path(dir_okay=False, path_type=Path),
+              help="Write the model there (gcar_deploy/quality/ghosts.json).")  # fmt: skip
+@_shared
+def ghost_fit(
+    trees: int,
+    seed: int,
+    check_trees: int,
+    check_seed: int,
+    write: Path | None,
+    data: Path | None,
+    cases: str,
+    out: Path,
+) -> None:
+    """Fit the probability of a ghost on generated trees; check it on others and on real ones.
+
+    Goes on where an earlier run with the same --out stopped: take a new one for a new predictor.
+
+    Example: gcar-export ghost-fit --data data --out ghosts --write gcar_deploy/quality/ghosts.json
+    """
+    from gcar_deploy.engine import Engine
+    from gcar_export.studies import ghost_fit as study
+
+    seeds = ((seed, trees), (check_seed, check_trees))
+    first, second, real = _measured(out, seeds, _labels(data, cases), ["same"])
+    model = study.fit(first)
+    groups = {f"fitted (seed {seed})": first, f"other (seed {check_seed})": second}
+    if real:
+        groups["real"] = real
+    digest = dict(Engine(threads=1).model or {}).get("sha256", "none")[:12]
+    made_of = study.made_of(first, seed, digest)
+    (write or out / "ghosts.json").write_text(study.as_json(model, made_of), encoding="utf-8")
+    tables = [made_of, study.summary_table(model, groups), study.reliability_table(model, groups)]
+    _say(tables, out / "ghosts.md")
+    study.draw(model, groups, out / "ghosts.png")
+    click.echo(out / "ghosts.png")

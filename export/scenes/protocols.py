@@ -148,8 +148,8 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
     if protocol == "paper":
         tree, carms, new, grid = label.roughly_centred(), *_paper_geometry(views)
     elif protocol in COMMON:
-        tree = _at_centroid(label.left_right()[COMMON[protocol][0]])
-        carms, new, grid = _common_geometry(protocol)
+        tree = at_centroid(label.left_right()[COMMON[protocol][0]])
+        carms, new, grid = common_geometry(protocol)
     else:
         tree = label.left_right()[0].centred()
         carms, new, grid = clinical_geometry(views)
@@ -242,7 +242,7 @@ def clinical_geometry(views: int) -> tuple[list[CArm], list[CArm], Grid]:
     )
 
 
-def _common_geometry(protocol: str) -> tuple[list[CArm], list[CArm], Grid]:
+def common_geometry(protocol: str) -> tuple[list[CArm], list[CArm], Grid]:
     """Return views, no new views, and the grid that measures are taken on."""
     _, pitch, directions = COMMON[protocol]
     carms = [
@@ -260,7 +260,7 @@ def _common_geometry(protocol: str) -> tuple[list[CArm], list[CArm], Grid]:
     return carms, [], Grid(center_mm=(0, 0, 0), size_mm=(128,) * 3, shape=(256,) * 3)
 
 
-def _at_centroid(tree: LabelVolume) -> LabelVolume:
+def at_centroid(tree: LabelVolume) -> LabelVolume:
     """Return the tree moved so that its centroid is the isocentre."""
     filled = np.argwhere(tree.occupancy >= 0.5)
     return tree.moved(-tree.grid.index2world(filled.mean(axis=0)))

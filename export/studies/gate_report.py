@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import QualityOptions
-from gcar_deploy.quality.gates import check_order, disagreement_limits
+from gcar_deploy.quality import check_order, disagreement_limits
 from gcar_deploy.quality.status import DEGRADED, OK, REFUSED
 from gcar_export.studies.gate_pairs import KINDS, PICTURES, UNITS, WRONG
-from gcar_export.studies.gate_table import GATES, Row, choose, cost, replayed, with_gate
+from gcar_export.studies.gate_rows import Row
+from gcar_export.studies.gate_table import GATES, choose, cost, kind_of_row, replayed, with_gate
 
 _STATUSES = (OK, DEGRADED, REFUSED)
 
@@ -55,9 +56,8 @@ def _status_line(own: Sequence[Row], pictures: str, kind: str, gates: QualityOpt
 
 
 def _hint(row: Row, gates: QualityOptions) -> str:
-    calibrated = row.pictures == "path length"
     disagreement = row.whole.disagreement
-    return check_order(("1", "2"), disagreement, row.other_order, calibrated, gates)[1]
+    return check_order(("1", "2"), disagreement, row.other_order, kind_of_row(row), gates)[1]
 
 
 def level_table(rows: Sequence[Row], gates: QualityOptions) -> str:
@@ -150,14 +150,15 @@ def draw(rows: Sequence[Row], gates: QualityOptions, file: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.4, 6.0), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(PICTURES), 6.0), layout="constrained")
     FigureCanvasAgg(figure)
     for k, pictures in enumerate(PICTURES):
         own = [r for r in rows if r.pictures == pictures]
-        raw = pictures == "raw"
-        good, most = disagreement_limits(not raw, gates)
-        _histogram(figure.add_subplot(2, 2, 1 + k), own, pictures, (good, most))
-        panel = figure.add_subplot(2, 2, 3 + k)
+        if not own:
+            continue
+        good, most = disagreement_limits(kind_of_row(own[0]), gates)
+        _histogram(figure.add_subplot(2, len(PICTURES), 1 + k), own, pictures, (good, most))
+        panel = figure.add_subplot(2, len(PICTURES), 1 + len(PICTURES) + k)
         for kind, colour in (("same", "C0"), ("two trees", "0.6"), ("swapped", "C3")):
             part = [r for r in own if r.kind == kind and r.other_order is not None]
             panel.plot(
@@ -185,5 +186,5 @@ def _histogram(panel: Any, rows: Sequence[Row], pictures: str, gates: tuple[floa
     for gate, style in zip(gates, ("--", "-"), strict=True):
         panel.axvline(100 * gate, color="k", linestyle=style, linewidth=0.8)
     panel.set(xscale="log", xlabel="disagreement along the epipolar lines, %",
-              ylabel="pairs, %", title=f"{pictures} pictures")  # fmt: skip
+              ylabel="pairs, %", title=pictures)  # fmt: skip
     panel.legend(fontsize=7)
