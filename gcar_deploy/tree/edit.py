@@ -9,6 +9,9 @@ import numpy as np
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array
 
+#: what every point of a branch has, whatever is known of it
+_PER_POINT = ("points_mm", "radius_mm", "sigma_mm", "confidence")
+
 
 def kept_branches(tree: Tree, keep: Array) -> Tree:
     """Keep some branches, (b,) bool; nodes with two ends left become inner points."""
@@ -70,26 +73,13 @@ def merged(tree: Tree) -> Tree:
 
 def reversed_branch(branch: Branch) -> Branch:
     """Return the branch run the other way."""
-    return Branch(
-        points_mm=branch.points_mm[::-1],
-        radius_mm=branch.radius_mm[::-1],
-        sigma_mm=branch.sigma_mm[::-1],
-        confidence=branch.confidence[::-1],
-        start=branch.end,
-        end=branch.start,
-    )
+    turned = _points_of(branch, slice(None, None, -1))
+    return dataclasses.replace(turned, start=branch.end, end=branch.start)
 
 
 def part_of(branch: Branch, first: int, last: int) -> Branch:
     """Points ``first`` to ``last`` (inclusive) of a branch; its node numbers are kept."""
-    cut = slice(first, last + 1)
-    return dataclasses.replace(
-        branch,
-        points_mm=branch.points_mm[cut],
-        radius_mm=branch.radius_mm[cut],
-        sigma_mm=branch.sigma_mm[cut],
-        confidence=branch.confidence[cut],
-    )
+    return _points_of(branch, slice(first, last + 1))
 
 
 def with_ends_moved(tree: Tree) -> Tree:
@@ -106,9 +96,21 @@ def with_ends_moved(tree: Tree) -> Tree:
     return dataclasses.replace(tree, nodes_mm=nodes)
 
 
+def _points_of(branch: Branch, cut: slice) -> Branch:
+    known = branch.covariance_mm2
+    return dataclasses.replace(
+        branch,
+        **{name: getattr(branch, name)[cut] for name in _PER_POINT},
+        covariance_mm2=None if known is None else known[cut],
+    )
+
+
 def _concatenated(first: Branch, second: Branch) -> Branch:
     parts = {
         name: np.concatenate([getattr(first, name), getattr(second, name)[1:]])
-        for name in ("points_mm", "radius_mm", "sigma_mm", "confidence")
+        for name in _PER_POINT
     }
-    return Branch(**parts, start=first.start, end=second.end)
+    both = None
+    if first.covariance_mm2 is not None and second.covariance_mm2 is not None:
+        both = np.concatenate([first.covariance_mm2, second.covariance_mm2[1:]])
+    return Branch(**parts, start=first.start, end=second.end, covariance_mm2=both)

@@ -21,6 +21,9 @@ class Branch:
     confidence : (m,) 0 .. 1, how much of what the radius claims the starting points support
     start, end : int
         Rows of ``Tree.nodes_mm``.
+    covariance_mm2 : (m, 2, 3, 3) covariance of the position across the vessel, mm^2 LPS: what the
+        fit leaves open, and what the geometry adds; None if unknown. ``sigma_mm`` is the worst
+        direction of their sum. Both hold if the branch is real
     """
 
     points_mm: Points
@@ -29,6 +32,7 @@ class Branch:
     confidence: Scalars
     start: int
     end: int
+    covariance_mm2: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points_mm)

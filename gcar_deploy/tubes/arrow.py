@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg.lapack import dpbtrf, dpbtrs, dpotrf, dpotrs
 
 from gcar_deploy.tubes.model import Tubes
-from gcar_deploy.types import Array, Points, Scalars
+from gcar_deploy.types import Array, Scalars
 
 #: diagonals of the band below the main one: second differences of positions, four unknowns a point
 BAND = 10
@@ -198,35 +198,4 @@ class Factor:
             joints[-1] = 0.0
             chain = chain - np.einsum("ij,ij->i", self.inner, joints[plan.columns[plan.branch]])
         out: Scalars = np.concatenate([chain, joints[:-1]])[plan.place]
-        return out
-
-    def position_blocks(self, positions: Array) -> Points:
-        """(k, 3, 3) blocks of the inverse on the diagonal, of the given positions."""
-        plan = self.plan
-        row = plan.place[3 * positions[:, None] + np.arange(3)]
-        schur = np.zeros((plan.border + 1, plan.border + 1))
-        if plan.border:
-            schur[:-1, :-1] = dpotrs(self.lower, np.eye(plan.border), lower=1)[0]
-        out = np.empty((len(positions), 3, 3))
-        joint = row[:, 0] >= plan.chain
-        at = row[joint] - plan.chain
-        out[joint] = schur[at[:, :, None], at[:, None, :]]
-        row = row[~joint]
-        if not len(row):
-            return out
-        # Branches do not couple within T: positions of different ones share right-hand sides.
-        branch = plan.branch[row[:, 0]]
-        order = np.argsort(branch, kind="stable")
-        turn = np.empty(len(row), np.int64)
-        begins = np.flatnonzero(np.diff(branch[order], prepend=-1))
-        counts = np.diff(np.append(begins, len(row)))
-        turn[order] = np.arange(len(row)) - np.repeat(begins, counts)
-        right = np.zeros((plan.chain, 3 * int(counts.max())), order="F")
-        column = 3 * turn[:, None] + np.arange(3)
-        right[row, column] = 1.0
-        solved = dpbtrs(self.band, right, lower=1)[0]
-        own = solved[row[:, :, None], column[:, None, :]]
-        inner, columns = self.inner[row], plan.columns[branch]
-        middle = schur[columns[:, :, None], columns[:, None, :]]
-        out[~joint] = own + inner @ middle @ np.swapaxes(inner, 1, 2)
         return out

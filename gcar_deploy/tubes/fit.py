@@ -17,21 +17,17 @@ from gcar_deploy.tubes.gauss_newton import (
     Progress,
     fit_level,
     footprints,
-    normal_equations,
     rescaled,
 )
+from gcar_deploy.tubes.hessian import seen_by
 from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
 from gcar_deploy.tubes.prior import TAPER_PIXEL_MM, Prior, make_prior
 from gcar_deploy.tubes.radius_refit import refit_radii
 from gcar_deploy.tubes.settle import settled
 from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, unexplained
 from gcar_deploy.tubes.targets import Target, make_targets
-from gcar_deploy.tubes.uncertainty import fit_sigma, geometry_sigma
+from gcar_deploy.tubes.uncertainty import spread, worst
 from gcar_deploy.types import Array, Scalars
-
-#: error of a tube between the pixels, as a share of the coarsest pixel at the isocentre. Chosen
-#: on generated trees (``gcar-export sigma-table --seed 1``), to be judged on another seed
-PIXEL_SHARE = 0.45
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -227,17 +223,20 @@ def tree_of(tubes: Tubes, tree: Tree) -> Tree:
 
 
 def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
-    """Return the tree with sigma per point: fit, geometry prior and pixel, in quadrature."""
+    """Return the tree with covariance and sigma per point."""
     tree, tubes = now.tree, now.tubes
-    hessian, _ = normal_equations(tubes, targets, now.prints, now.prior, options)
-    tangents = np.zeros_like(tubes.positions_mm)
-    tangents[tubes.owner] = np.concatenate([branch.tangents for branch in tree.branches])
-    own = fit_sigma(hessian, tubes.owner, tangents)[tubes.owner]
-    geometry = geometry_sigma(tubes.points_mm, [target.carm for target in targets])
-    pixel = PIXEL_SHARE * _pixel_mm(targets)
-    sigma = np.sqrt(own**2 + geometry**2 + pixel**2)
-    branches = [
-        dataclasses.replace(branch, sigma_mm=sigma[tubes.point_branch == k])
-        for k, branch in enumerate(tree.branches)
+    views = [
+        seen_by(tubes, target, seen, options)
+        for target, seen in zip(targets, now.prints, strict=True)
     ]
+    tangents = np.concatenate([branch.tangents for branch in tree.branches])
+    parts = spread(tubes, tangents, views, now.prior)
+    covariance = np.stack([parts.fit, parts.geometry], axis=1)
+    sigma = worst(parts.fit + parts.geometry)
+    branches = []
+    for k, branch in enumerate(tree.branches):
+        own = tubes.point_branch == k
+        branches.append(
+            dataclasses.replace(branch, sigma_mm=sigma[own], covariance_mm2=covariance[own])
+        )
     return dataclasses.replace(tree, branches=tuple(branches))

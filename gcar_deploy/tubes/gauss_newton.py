@@ -159,15 +159,11 @@ def normal_equations(
     for target, seen in zip(targets, prints, strict=True):
         if not len(seen.pixel):
             continue
-        e = (target.path_mm.reshape(-1)[seen.pixel[seen.first]] - target.contrast * seen.totals())[
-            seen.group
-        ]
-        sigma = target.sigma_mm.reshape(-1)[seen.pixel]
-        robust = 1.0 / (1.0 + (e / (options.robust_sigmas * sigma)) ** 2)
-        w = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
-        moments = _moments(seen, w * seen.crossings * target.contrast**2, count)
+        w, e = weights_of(target, seen, options)
+        # Each crossing counts as often as there are: the bound of the couplings left out.
+        moments = moments_of(seen, w * seen.crossings * target.contrast**2, count)
         pulls = _pulls(seen, w * e * target.contrast, count)
-        M = _to_unknowns(tubes, target.carm)
+        M = to_unknowns(tubes, target.carm)
         blocks += M @ moments @ np.swapaxes(M, 1, 2)
         pull += (M @ pulls[:, :, None])[:, :, 0]
     gradient = prior.gradient(unknowns(tubes))
@@ -175,7 +171,17 @@ def normal_equations(
     return prior.added(blocks), gradient
 
 
-def _basis(seen: Footprint) -> tuple[Scalars, ...]:
+def weights_of(target: Target, seen: Footprint, options: TubeOptions) -> tuple[Scalars, Scalars]:
+    """(e,) weight of each entry's pixel, 1 / mm^2, and (e,) what the model leaves of its path."""
+    path = target.path_mm.reshape(-1)[seen.pixel[seen.first]]
+    left = (path - target.contrast * seen.totals())[seen.group]
+    sigma = target.sigma_mm.reshape(-1)[seen.pixel]
+    robust = 1.0 / (1.0 + (left / (options.robust_sigmas * sigma)) ** 2)
+    weight = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
+    return weight, left
+
+
+def basis_of(seen: Footprint) -> tuple[Scalars, ...]:
     """Six derivatives of an entry's path: by both ends' pixels (col, row) and log radii."""
     # The distance shrinks when the axis moves towards the pixel.
     x = -seen.d_distance * seen.normal[:, 0]
@@ -185,9 +191,9 @@ def _basis(seen: Footprint) -> tuple[Scalars, ...]:
     return x * s, y * s, x * t, y * t, r * s, r * t
 
 
-def _moments(seen: Footprint, weight: Scalars, count: int) -> Array:
+def moments_of(seen: Footprint, weight: Scalars, count: int) -> Array:
     """(s, 6, 6) weighted sums of products of the derivatives over each segment's entries."""
-    basis = _basis(seen)
+    basis = basis_of(seen)
     out = np.empty((count, 6, 6))
     for a in range(6):
         scaled = weight * basis[a]
@@ -199,11 +205,11 @@ def _moments(seen: Footprint, weight: Scalars, count: int) -> Array:
 
 def _pulls(seen: Footprint, weight: Scalars, count: int) -> Array:
     """(s, 6) weighted sums of the derivatives over each segment's entries."""
-    sums = [np.bincount(seen.segment, weight * d, minlength=count) for d in _basis(seen)]
+    sums = [np.bincount(seen.segment, weight * d, minlength=count) for d in basis_of(seen)]
     return np.stack(sums, axis=1)
 
 
-def _to_unknowns(tubes: Tubes, carm: CArm) -> Array:
+def to_unknowns(tubes: Tubes, carm: CArm) -> Array:
     """(s, 8, 6) from derivatives by pixels and log radii to those by a segment's unknowns."""
     J = np.swapaxes(carm.jacobian(tubes.points_mm), 1, 2)
     out = np.zeros((len(tubes.first), 8, 6))

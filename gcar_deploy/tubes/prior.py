@@ -35,6 +35,7 @@ class Prior:
     b : (m,)
     hessian : A^T A
     slots : (s, 8, 8) where in ``hessian.data`` a segment's unknowns meet
+    hold : (unknowns,) share of the diagonal of ``hessian`` that the anchors are
     start, trust : what it was made of
     easing : factor on the taper's random walk
     """
@@ -43,6 +44,7 @@ class Prior:
     b: Scalars
     hessian: Arrow
     slots: Array
+    hold: Scalars
     start: Tubes
     trust: Scalars
     easing: float
@@ -122,7 +124,10 @@ def make_prior(
     ).astype(np.float64)[: plan.size]
     columns = columns_of(tubes)
     met = plan.slots(*np.broadcast_arrays(columns[:, :, None], columns[:, None, :]))
-    return Prior(_rows(parts, len(start)), b, Arrow(plan, data), met, tubes, trust, easing)
+    return Prior(
+        A=_rows(parts, len(start)), b=b, hessian=Arrow(plan, data), slots=met, hold=hold**2,
+        start=tubes, trust=trust, easing=easing,
+    )  # fmt: skip
 
 
 def _rows(parts: list[tuple[Array, Array]], unknowns: int) -> sparse.csr_matrix:

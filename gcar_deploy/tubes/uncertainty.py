@@ -1,89 +1,147 @@
-"""Standard deviation of each centreline point: noise of the fit, and a prior on the geometry.
+"""Covariance of each centreline point: what the fit leaves open, and what the geometry does.
 
-The fit's part is the inverse of the Gauss-Newton Hessian (prior and data), its largest
-eigenvalue per point; the geometry's part is how far the point moves when an angle or the table
-is off by the stated prior, triangulated with the point's own rays (NUMERICAL: first differences).
+The fit's part is the inverse of its true Gauss-Newton Hessian (``hessian``), pictures and prior
+together, so that all that couples is in it: neighbours along a vessel, branches at a fork, vessels
+that share rays. The geometry's part is what this fit makes of views that stand elsewhere: their
+angles and the patient are further unknowns with the stated prior. What the pictures would notice
+is not left open; what they would not (a move along the beams) is, and adds
+
+    X C X^T,   X = -H^-1 B,   C = (S^-1 + G - B^T H^-1 B)^-1,
+
+B and G the blocks of the joint Hessian, S the prior (Schur complement of the points). Both parts
+hold if the branch is there at all: another vessel behind the same rays is another question.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
 
 from gcar_deploy.errors import NumericalError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
-from gcar_deploy.tubes.arrow import Arrow
-from gcar_deploy.types import Array, Points, Scalars
+from gcar_deploy.tubes.hessian import Seen
+from gcar_deploy.tubes.model import Tubes
+from gcar_deploy.tubes.prior import Prior
+from gcar_deploy.types import Array, Pixels, Points, Scalars
 
 #: covariances are solved for every so many points and interpolated between.
 EVERY = 5
-#: model error (sections that are not round, overlaps) makes neighbouring pixels err together;
-#: the pictures count as if they had so many times fewer independent pixels.
-CORRELATED_PIXELS = 6.0
-#: smallest eigenvalue of the normal matrix, relative to the largest, that counts as seen.
-RELATIVE_CUT = 1e-6
+#: a starting point errs as its neighbours do, and moves with the geometry it was found in: the
+#: starting points hold so many times less than the fit lets them
+SHARED_STARTS = 100.0
+#: error of a tube between the pixels, as a share of the coarsest pixel at the isocentre
+PIXEL_SHARE = 0.15
+#: step of the first differences by a view's place, mm and degrees
+_STEP = 0.1
 
 
-def fit_sigma(hessian: Arrow, owner: Array, tangents: Points) -> Scalars:
-    """(p,) largest standard deviation of each position across its vessel, mm.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Spread:
+    """Covariances of n branch points across their vessel, mm^2 LPS; along it they are 0.
 
-    Along the vessel a point may slide without changing the tube, so that direction is left out.
+    Along a vessel a point may slide without changing the tube.
+
+    Attributes
+    ----------
+    fit, geometry : (n, 3, 3) parts that add
+    """
+
+    fit: Array
+    geometry: Array
+
+
+def spread(tubes: Tubes, tangents: Points, views: Sequence[Seen], prior: Prior) -> Spread:
+    """Work out both parts of the covariance of every branch point.
 
     Parameters
     ----------
-    hessian : Arrow over the (3 p + n) unknowns
-    owner : (n,) position of each branch point, in order along the branches
-    tangents : (p, 3) unit vector along the vessel at each position
+    tubes : Tubes at the fit
+    tangents : (n, 3) unit vector along the vessel at each branch point
+    views : what each view says of them
+    prior : Prior of the fit
 
     Raises
     ------
     NumericalError
-        The matrix is not positive definite.
+        The Hessian is singular.
     """
-    positions = len(tangents)
-    if not positions:
-        return np.zeros(0)
-    factor = hessian.factorised()
-    if factor is None:
-        raise NumericalError("the normal matrix of the fit is not positive definite")
-    chosen = np.unique(np.concatenate([owner[::EVERY], owner[-1:]]))
-    own = factor.position_blocks(chosen)
-    t = tangents[chosen]
-    across = np.eye(3) - t[:, :, None] * t[:, None, :]
-    own = across @ own @ across
-    largest = np.linalg.eigvalsh(0.5 * (own + np.swapaxes(own, 1, 2)))[:, -1]
-    sigma = np.sqrt(np.maximum(largest, 0.0) * CORRELATED_PIXELS)
-    # Along the order of the branch points, every position is next to a solved one.
-    place = np.flatnonzero(np.isin(owner, chosen))
-    known = sigma[np.searchsorted(chosen, owner[place])]
-    along = np.interp(np.arange(len(owner)), place, known)
-    out = np.zeros(positions)
-    out[owner] = along
+    n = len(tubes.owner)
+    if not n:
+        return Spread(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
+    factor = _factorised(sum(view.hessian() for view in views), prior)
+    ends = np.flatnonzero(np.diff(tubes.point_branch, prepend=-1, append=-1))
+    places = np.unique(np.concatenate([np.arange(0, n, EVERY), ends[:-1], ends[1:] - 1]))
+    row = 3 * tubes.owner[places][:, None] + np.arange(3)
+    parts = [_fit(factor, row), _geometry(factor, row, tubes, views)]
+    across = np.eye(3) - tangents[:, :, None] * tangents[:, None, :]
+    coarsest = max(view.carm.pixel_at_isocenter_mm for view in views)
+    parts[0] = parts[0] + (PIXEL_SHARE * coarsest) ** 2 * np.eye(3)
+    return Spread(*(across @ _between(part, places, n) @ across for part in parts))
+
+
+def worst(covariance: Array) -> Scalars:
+    """(n,) standard deviation in the direction where it is largest, of (n, 3, 3)."""
+    largest: Scalars = np.linalg.eigvalsh(covariance)[:, -1]
+    return np.sqrt(np.maximum(largest, 0.0))
+
+
+def _factorised(hessian: sparse.csc_matrix, prior: Prior) -> SuperLU:
+    starts = sparse.diags((1.0 - 1.0 / SHARED_STARTS) * prior.hold)
+    whole = (hessian + prior.A.T @ prior.A - starts).tocsc()
+    # Positions of no branch have no equation: any value will do.
+    whole = whole + sparse.diags((whole.diagonal() == 0).astype(np.float64), format="csc")
+    try:
+        # Symmetric and positive definite: no pivoting, and the order suits both triangles.
+        factor = splu(whole, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                      options={"SymmetricMode": True})  # fmt: skip
+    except RuntimeError as error:
+        raise NumericalError(f"the Hessian of the fit is singular: {error}") from None
+    return factor
+
+
+def _fit(factor: SuperLU, row: Array) -> Array:
+    """(k, 3, 3) blocks of the inverse at (k, 3) rows."""
+    rows, back = np.unique(row, return_inverse=True)
+    back = back.reshape(row.shape)
+    unit = np.zeros((factor.shape[0], len(rows)))
+    unit[rows, np.arange(len(rows))] = 1.0
+    solved = factor.solve(unit)
+    out: Array = solved[row[:, :, None], back[:, None, :]]
+    return 0.5 * (out + np.swapaxes(out, 1, 2))
+
+
+def _geometry(factor: SuperLU, row: Array, tubes: Tubes, views: Sequence[Seen]) -> Array:
+    """(k, 3, 3) what views that may stand elsewhere add at (k, 3) rows."""
+    if len(views) < 2:
+        return np.zeros((len(row), 3, 3))
+    pulls = [view.pull(_moved(view.carm, tubes.points_mm)) for view in views[1:]]
+    B = np.concatenate([pull for pull, _ in pulls], axis=1)
+    X = -factor.solve(B)
+    inverse = np.diag(np.tile([LEFT_MM**-2] * 3 + [LEFT_DEG**-2] * 2, len(pulls)))
+    inverse += sparse.block_diag([own for _, own in pulls]).toarray() + B.T @ X
+    here = X[row]
+    out: Array = here @ np.linalg.inv(inverse) @ np.swapaxes(here, 1, 2)
     return out
 
 
-def geometry_sigma(points_mm: Points, carms: list[CArm]) -> Scalars:
-    """(n,) movement of triangulated points under the stated prior of the geometry, mm.
+def _moved(carm: CArm, points_mm: Points) -> list[Pixels]:
+    """(n, 2) pixels per mm and degree that points move by: table x, y, z, then both angles."""
+    base = carm.project(points_mm)[0]
+    other = [carm.moved(_STEP * axis) for axis in np.eye(3)]
+    other += [carm.turned(primary_deg=_STEP), carm.turned(secondary_deg=_STEP)]
+    return [
+        np.nan_to_num((view.project(points_mm)[0] - base) / _STEP, posinf=0.0, neginf=0.0)
+        for view in other
+    ]
 
-    Each view after the first may have its two angles off by ``LEFT_DEG`` and the table by
-    ``LEFT_MM`` along each axis, independently.
-    """
-    if len(carms) < 2 or not len(points_mm):
-        return np.zeros(len(points_mm))
-    J = np.concatenate([carm.jacobian(points_mm) for carm in carms], axis=1)
-    normal = np.swapaxes(J, 1, 2) @ J
-    pinv = np.linalg.pinv(normal, rcond=RELATIVE_CUT, hermitian=True) @ np.swapaxes(J, 1, 2)
-    total = np.zeros(len(points_mm))
-    for v, carm in enumerate(carms[1:], start=1):
-        base = carm.project(points_mm)[0]
-        changed = [carm.moved(LEFT_MM * axis) for axis in np.eye(3)]
-        changed += [
-            carm.turned(primary_deg=LEFT_DEG),
-            carm.turned(secondary_deg=LEFT_DEG),
-        ]
-        for other in changed:
-            shift = np.nan_to_num(other.project(points_mm)[0] - base, posinf=0.0, neginf=0.0)
-            total += np.sum(
-                (pinv[:, :, 2 * v : 2 * v + 2] @ shift[:, :, None])[:, :, 0] ** 2, axis=1
-            )
-    return np.sqrt(total)
+
+def _between(known: Array, places: Array, n: int) -> Array:
+    """(n, 3, 3) linear in between (k, 3, 3) at ``places``, which hold both ends of branches."""
+    flat = known.reshape(-1, 9)
+    at = np.arange(n)
+    return np.stack([np.interp(at, places, column) for column in flat.T], 1).reshape(-1, 3, 3)

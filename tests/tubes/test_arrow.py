@@ -78,19 +78,6 @@ def test_matrix_and_solution_are_those_of_the_dense_twin(name):
     assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("name", TREES)
-def test_blocks_of_the_inverse(name):
-    tubes, arrow, dense = filled(TREES[name])
-    used = np.flatnonzero(np.diagonal(dense) > 0)
-    inverse = np.zeros_like(dense)
-    inverse[np.ix_(used, used)] = np.linalg.inv(dense[np.ix_(used, used)])
-    positions = np.unique(tubes.owner)
-    found = arrow.factorised().position_blocks(positions)
-    for block, position in zip(found, positions, strict=True):
-        at = 3 * position + np.arange(3)
-        assert np.allclose(block, inverse[np.ix_(at, at)], rtol=1e-7, atol=1e-12)
-
-
 def test_damping_grows_the_diagonal_alone():
     _, arrow, dense = filled(TREES["fork"])
     damped = arrow.damped(0.5, 0.25).dense() - dense
