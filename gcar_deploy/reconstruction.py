@@ -18,7 +18,12 @@ from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.geometry.observability import EXACT_DISAGREEMENT, silent_errors
+from gcar_deploy.geometry.observability import (
+    EXACT_DISAGREEMENT,
+    depth_and_plane,
+    silent_errors,
+    worst_sigma,
+)
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.measure import BranchName, Measured, measured
 from gcar_deploy.measure.lumen import BranchLumen
@@ -216,7 +221,7 @@ class Reconstruction:
         told = [None] * len(self.tree.branches) if ghosts is None else ghosts.branches.tolist()
         parts = zip(self.tree.branches, self.measured.lumens, self.names, told, strict=True)
         return [
-            {"branch": k, **_branch(branch, lumen, name), "ghost_probability": ghost}
+            {"branch": k, **_branch(branch, lumen, name, self._carms), "ghost_probability": ghost}
             for k, (branch, lumen, name, ghost) in enumerate(parts, start=1)
         ]
 
@@ -307,7 +312,9 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def _branch(branch: Branch, lumen: BranchLumen, name: BranchName | None) -> dict[str, Any]:
+def _branch(
+    branch: Branch, lumen: BranchLumen, name: BranchName | None, carms: Sequence[CArm]
+) -> dict[str, Any]:
     known = branch.sigma_mm[np.isfinite(branch.sigma_mm)]
     return {
         "name": None if name is None else name.name,
@@ -318,6 +325,7 @@ def _branch(branch: Branch, lumen: BranchLumen, name: BranchName | None) -> dict
         "mean_radius_mm": float(branch.radius_mm.mean()),
         "min_radius_mm": float(branch.radius_mm.min()),
         "mean_sigma_mm": float(known.mean()) if len(known) else None,
+        **_sigma(branch, carms),
         "confidence": float(branch.confidence.mean()),
         "minimal_diameter_mm": lumen.minimal_diameter_mm,
         "minimal_at_mm": lumen.minimal_at_mm,
@@ -325,6 +333,19 @@ def _branch(branch: Branch, lumen: BranchLumen, name: BranchName | None) -> dict
         "stenosis_percent": lumen.stenosis_percent,
         "lesion_length_mm": lumen.lesion_length_mm,
     }
+
+
+def _sigma(branch: Branch, carms: Sequence[CArm]) -> dict[str, float | None]:
+    """Mean sigma of a branch by its causes and by its axes; None where it is unknown."""
+    names = (
+        "mean_sigma_fit_mm", "mean_sigma_geometry_mm", "mean_sigma_depth_mm", "mean_sigma_plane_mm",
+    )  # fmt: skip
+    if branch.covariance_mm2 is None:
+        return dict.fromkeys(names)
+    fit, geometry = (worst_sigma(branch.covariance_mm2[:, part]) for part in (0, 1))
+    axes = depth_and_plane(branch.covariance_mm2.sum(axis=1), branch.points_mm, carms)
+    means = (float(sigma.mean()) for sigma in (fit, geometry, *axes))
+    return dict(zip(names, means, strict=True))
 
 
 def plain(value: Any, path: str, reasons: dict[str, str]) -> Any:

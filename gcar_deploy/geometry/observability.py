@@ -128,6 +128,36 @@ def classes(sigma_mm: Scalars, noise_mm: float) -> Array:
     return np.where(ratio < WEAK, 0, np.where(ratio <= NONE, 1, 2)).astype(np.int64)
 
 
+def worst_sigma(covariance: Array) -> Scalars:
+    """(n,) standard deviation in the direction where it is largest, mm, of (n, 3, 3) mm^2."""
+    largest: Scalars = np.linalg.eigvalsh(covariance)[:, -1]
+    return np.sqrt(np.maximum(largest, 0.0))
+
+
+def depth_and_plane(
+    covariance: Array, points_mm: Points, carms: Sequence[CArm]
+) -> tuple[Scalars, Scalars]:
+    """Split standard deviations into depth and what a picture shows, root mean square of the views.
+
+    Parameters
+    ----------
+    covariance : (n, 3, 3) mm^2
+    points_mm : (n, 3) mm LPS
+    carms : views
+
+    Returns
+    -------
+    depth, plane : (n,) mm, along a view's beam, and per axis across it
+    """
+    depth2 = np.zeros(len(points_mm))
+    for carm in carms:
+        ray = points_mm - carm.source_mm
+        ray = ray / np.linalg.norm(ray, axis=1)[:, None]
+        depth2 += np.einsum("ni,nij,nj->n", ray, covariance, ray) / len(carms)
+    plane2 = 0.5 * (np.trace(covariance, axis1=1, axis2=2) - depth2)
+    return np.sqrt(np.maximum(depth2, 0.0)), np.sqrt(np.maximum(plane2, 0.0))
+
+
 def geometry_sigmas(
     carms: Sequence[CArm], points_mm: Points, prior: GeometryPrior | None = None
 ) -> Scalars:

@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.geometry.observability import worst_sigma
 from gcar_deploy.measure import Measured
 from gcar_deploy.output.vtp import poly_data
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
 #: zeroth spherical harmonic, of the 3DGS convention's colour f_dc
@@ -20,6 +21,9 @@ _SH0 = 0.28209479177387814
 _RED = (0.86, 0.16, 0.16)
 #: a viewer's opacity is a share; outside these its logit is no use
 _OPACITY_RANGE = (0.01, 0.99)
+
+#: entries of a covariance, in the order of a symmetric tensor in VTK
+_ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "yz": (1, 2), "xz": (0, 2)}
 
 
 def npz_bytes(arrays: Mapping[str, Array | str | float]) -> bytes:
@@ -81,6 +85,7 @@ def centerline_vtp(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
 
     A branch without a name has an empty ``VesselName`` and no (NaN) ``NameConfidence``. ``ghosts``
     are per branch (m,) probabilities that the vessel is not there, NaN where they are not known.
+    Covariances are mm^2 LPS in the order xx, yy, zz, xy, yz, xz; the whole one is the sum of both.
     """
     sizes = [len(branch) for branch in tree.branches]
     radius = tree.radii()
@@ -91,6 +96,8 @@ def centerline_vtp(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
         "Confidence": _of_points(tree, "confidence"),
         "GhostProbability": np.concatenate([np.zeros(0), *ghosts]),
     }
+    for part, name in enumerate(("Fit", "Geometry")):
+        point_data[f"Sigma{name}"], point_data[f"Covariance{name}"] = _spreads(tree, part)
     cell_data: dict[str, Array | Sequence[str]] = {
         "BranchId": np.arange(1, len(sizes) + 1, dtype=np.int64),
         "StartNode": np.array([branch.start for branch in tree.branches], dtype=np.int64),
@@ -110,22 +117,27 @@ def centerline_vtp(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
 def centerline_csv(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) -> bytes:
     """One row per centreline point; an unknown sigma, ghost or name is an empty field.
 
-    Branches are numbered from 1, as in the pictures, the report and ``centerline.vtp``. ``ghosts``
-    as there.
+    The covariance is the sum of fit and geometry. Branches are numbered from 1, as in the
+    pictures, the report and ``centerline.vtp``. ``ghosts`` as there.
     """
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     columns_of_points = ["arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
-    last = ["name", "name_confidence", "ghost_probability"]
+    more = ["sigma_fit_mm", "sigma_geometry_mm", *(f"cov_{name}_mm2" for name in _ENTRIES)]
+    last = ["name", "name_confidence", "ghost_probability", *more]
     writer.writerow(["branch", "point", *columns_of_points, *last])
     told = zip(tree.branches, _told(measured), ghosts, strict=True)
     for number, (branch, (name, share), ghost) in enumerate(told, 1):
+        (fit, fit6), (geometry, geometry6) = _spread(branch, 0), _spread(branch, 1)
+        spread = np.column_stack([fit, geometry, fit6 + geometry6])
         columns = np.column_stack(
             [branch.arc_mm, branch.points_mm, branch.radius_mm, branch.sigma_mm, branch.confidence]
         )
         for point, row in enumerate(columns):
             fields = [_field(value) for value in row]
-            writer.writerow([number, point, *fields, name, _field(share), _field(ghost[point])])
+            row_spread = [_field(value) for value in spread[point]]
+            own = [name, _field(share), _field(ghost[point])]
+            writer.writerow([number, point, *fields, *own, *row_spread])
     return stream.getvalue().encode("ascii")
 
 
@@ -135,6 +147,21 @@ def _told(measured: Measured) -> list[tuple[str, float]]:
         ("", float("nan")) if name is None else (name.name, name.confidence)
         for name in measured.names
     ]
+
+
+def _spread(branch: Branch, part: int) -> tuple[Array, Array]:
+    """(m,) sigma in the worst direction and (m, 6) covariance of the fit (0) or geometry (1)."""
+    if branch.covariance_mm2 is None:
+        return np.full(len(branch), np.nan), np.full((len(branch), 6), np.nan)
+    covariance = branch.covariance_mm2[:, part]
+    return worst_sigma(covariance), covariance[:, *zip(*_ENTRIES.values(), strict=True)]
+
+
+def _spreads(tree: Tree, part: int) -> tuple[Array, Array]:
+    """``_spread`` of all branches' points, in order."""
+    each = [_spread(branch, part) for branch in tree.branches]
+    sigma = np.concatenate([np.zeros(0), *(one for one, _ in each)])
+    return sigma, np.concatenate([np.zeros((0, 6)), *(six for _, six in each)])
 
 
 def _of_points(tree: Tree, name: str) -> Array:

@@ -25,7 +25,7 @@ def poly_data(
     ----------
     points_mm : (n, 3) mm LPS
     sizes : points of each polyline, in their order; None where every point stands alone
-    point_data : name -> (n,) numbers; the first is what a viewer shows
+    point_data : name -> (n,) or (n, k) numbers; the first is what a viewer shows
     cell_data : name -> one number or text (ASCII) for each polyline, or for each lone point
     """
     count, kind = len(points_mm), "Verts" if sizes is None else "Lines"
@@ -40,7 +40,10 @@ def poly_data(
         + " ".join(f'NumberOf{name}="{many}"' for name, many in cells.items())
         + ">",
         f"<PointData{active}>",
-        *(_data_array(name, values) for name, values in point_data.items()),
+        *(
+            _data_array(name, values, 1 if values.ndim == 1 else values.shape[1])
+            for name, values in point_data.items()
+        ),
         "</PointData>",
         "<CellData>",
         *(_cell_array(name, values) for name, values in cell_data.items()),

@@ -9,6 +9,7 @@ import numpy as np
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.observability import worst_sigma
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
@@ -26,7 +27,7 @@ from gcar_deploy.tubes.radius_refit import refit_radii
 from gcar_deploy.tubes.settle import settled
 from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, unexplained
 from gcar_deploy.tubes.targets import Target, make_targets
-from gcar_deploy.tubes.uncertainty import spread, worst
+from gcar_deploy.tubes.uncertainty import spread
 from gcar_deploy.types import Array, Scalars
 
 
@@ -232,7 +233,7 @@ def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree
     tangents = np.concatenate([branch.tangents for branch in tree.branches])
     parts = spread(tubes, tangents, views, now.prior)
     covariance = np.stack([parts.fit, parts.geometry], axis=1)
-    sigma = worst(parts.fit + parts.geometry)
+    sigma = worst_sigma(parts.fit + parts.geometry)
     branches = []
     for k, branch in enumerate(tree.branches):
         own = tubes.point_branch == k

@@ -27,7 +27,7 @@ from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.tubes.hessian import Seen
 from gcar_deploy.tubes.model import Tubes
 from gcar_deploy.tubes.prior import Prior
-from gcar_deploy.types import Array, Pixels, Points, Scalars
+from gcar_deploy.types import Array, Pixels, Points
 
 #: covariances are solved for every so many points and interpolated between.
 EVERY = 5
@@ -82,12 +82,6 @@ def spread(tubes: Tubes, tangents: Points, views: Sequence[Seen], prior: Prior) 
     coarsest = max(view.carm.pixel_at_isocenter_mm for view in views)
     parts[0] = parts[0] + (PIXEL_SHARE * coarsest) ** 2 * np.eye(3)
     return Spread(*(across @ _between(part, places, n) @ across for part in parts))
-
-
-def worst(covariance: Array) -> Scalars:
-    """(n,) standard deviation in the direction where it is largest, of (n, 3, 3)."""
-    largest: Scalars = np.linalg.eigvalsh(covariance)[:, -1]
-    return np.sqrt(np.maximum(largest, 0.0))
 
 
 def _factorised(hessian: sparse.csc_matrix, prior: Prior) -> SuperLU:

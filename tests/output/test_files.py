@@ -145,6 +145,9 @@ def test_centreline_by_vtk(result, folder):
         np.testing.assert_array_equal(found, result.tree.radii())
     sigma = np.concatenate([branch.sigma_mm for branch in result.tree.branches])
     np.testing.assert_array_equal(vtk_to_numpy(data.GetPointData().GetArray("Sigma")), sigma)
+    fit = np.concatenate([branch.covariance_mm2[:, 0] for branch in result.tree.branches])
+    found = vtk_to_numpy(data.GetPointData().GetArray("CovarianceFit"))
+    np.testing.assert_array_equal(found, fit[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]])
     start = 0
     for number, branch in enumerate(result.tree.branches):
         ids = data.GetCell(number).GetPointIds()

@@ -122,6 +122,43 @@ def test_unknown_ghosts_are_empty_fields_and_null_with_a_reason(result):
     assert summary["tree"]["parts_mm"][0] <= summary["tree"]["length_mm"]
 
 
+def test_table_and_json_state_the_covariance_by_its_causes(result):
+    """Fit and geometry add; the worst direction of the sum is sigma; depth and plane its axes."""
+    written = centerline_csv(result.tree, result.measured, result.ghost_probability).decode("ascii")
+    rows = list(csv.DictReader(io.StringIO(written)))
+    fit, geometry = np.swapaxes(
+        np.concatenate([branch.covariance_mm2 for branch in result.tree.branches]), 0, 1
+    )
+    told = {key: np.array([float(row[key]) for row in rows]) for key in rows[0] if "_mm" in key}
+    names = [["xx", "xy", "xz"], ["xy", "yy", "yz"], ["xz", "yz", "zz"]]
+    whole = np.stack([told[f"cov_{name}_mm2"] for name in sum(names, [])], 1).reshape(-1, 3, 3)
+    np.testing.assert_allclose(whole, fit + geometry, atol=1e-5)
+    for name, part in (("fit", fit), ("geometry", geometry)):
+        largest = np.linalg.norm(part, 2, axis=(1, 2))
+        np.testing.assert_allclose(told[f"sigma_{name}_mm"] ** 2, largest, atol=1e-4)
+    np.testing.assert_allclose(told["sigma_mm"] ** 2, np.linalg.norm(whole, 2, axis=(1, 2)), 1e-3)
+    branch = result.summary()["tree"]["branches"][0]
+    own = np.array([row["branch"] == "1" for row in rows])
+    assert branch["mean_sigma_fit_mm"] == pytest.approx(told["sigma_fit_mm"][own].mean(), rel=1e-3)
+    # All of the variance is along a beam or across it, twice.
+    rays = [result.tree.branches[0].points_mm - view.carm.source_mm for view in result.views]
+    along = np.mean(
+        [np.einsum("ni,nij,nj->n", r, whole[own], r) / np.sum(r**2, axis=1) for r in rays], axis=0
+    )
+    assert branch["mean_sigma_depth_mm"] == pytest.approx(np.sqrt(along).mean(), rel=1e-3)
+    across = 0.5 * (np.trace(whole[own], axis1=1, axis2=2) - along)
+    assert branch["mean_sigma_plane_mm"] == pytest.approx(np.sqrt(across).mean(), rel=1e-3)
+
+
+def test_a_covariance_that_is_not_known_is_an_empty_field(result):
+    hidden = dataclasses.replace(result.tree.branches[0], covariance_mm2=None)
+    tree = dataclasses.replace(result.tree, branches=(hidden, *result.tree.branches[1:]))
+    written = centerline_csv(tree, result.measured, result.ghost_probability)
+    rows = list(csv.DictReader(io.StringIO(written.decode("ascii"))))
+    assert {row["cov_xy_mm2"] == "" for row in rows if row["branch"] == "1"} == {True}
+    assert {row["cov_xy_mm2"] == "" for row in rows if row["branch"] != "1"} <= {False}
+
+
 def long_tree(branches=40, points=400):
     t = np.linspace(0, 100, points)
     line = np.stack([t, np.sin(t / 9), t * 0], axis=1)

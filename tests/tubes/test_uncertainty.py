@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TubeOptions
+from gcar_deploy.geometry.observability import worst_sigma
 from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
@@ -15,7 +16,7 @@ from gcar_deploy.tubes.hessian import LEAST_MISFIT, PATCH_MM2, seen_by
 from gcar_deploy.tubes.model import tubes_of
 from gcar_deploy.tubes.prior import make_prior
 from gcar_deploy.tubes.targets import make_targets
-from gcar_deploy.tubes.uncertainty import PIXEL_SHARE, spread, worst
+from gcar_deploy.tubes.uncertainty import PIXEL_SHARE, spread
 from tests.hard.phantoms import distances, helix, seven
 from tests.tree.shapes import branch, grid, points_of, tube
 from tests.tubes.scenes import carm, seen, two_views
@@ -123,7 +124,7 @@ def test_geometry_of_a_lone_tube_at_the_isocentre(theta):
     tubes, targets, prints, prior = straight_tube(theta)
     geometry = parts_of(tubes, targets, prints, prior).geometry[30]
     expected = LEFT_MM / np.sin(np.radians(theta))
-    assert worst(geometry[None])[0] == pytest.approx(expected, rel=0.04)
+    assert worst_sigma(geometry[None])[0] == pytest.approx(expected, rel=0.04)
     beam = targets[0].carm.axes[2]
     assert np.sqrt(beam @ geometry @ beam) == pytest.approx(expected, rel=0.04)
 
@@ -209,7 +210,7 @@ def test_errors_of_whole_fits_are_those_that_sigma_states():
             z.append(error / sigma)
             points = fitted.points()
             covariance = np.concatenate([b.covariance_mm2 for b in fitted.branches]).sum(axis=1)
-            np.testing.assert_allclose(sigma, worst(covariance))
+            np.testing.assert_allclose(sigma, worst_sigma(covariance))
             depth.append(_along_depth(points, dense, covariance, fitted, told))
     together = np.concatenate(z)
 
