@@ -44,6 +44,8 @@ COMMON: Mapping[str, tuple[int, float, tuple[tuple[float, float], ...]]] = {
     "common-lca": (0, 0.65, ((-25, -35), (40, 20))),
     "common-rca": (1, 0.55, ((-20, 20), (60, 0))),
 }
+#: where masks are made of rendered paths: a ray through so much vessel or more is vessel, mm
+MASK_PATH_MM = 0.25
 PROTOCOLS = ("paper", "clinical", "moved", "raw", *COMMON)
 #: mm of vessel per count of a simulated 16-bit picture.
 MM_PER_COUNT = 0.001

@@ -130,8 +130,8 @@ def test_table_and_json_state_the_covariance_by_its_causes(result):
         np.concatenate([branch.covariance_mm2 for branch in result.tree.branches]), 0, 1
     )
     told = {key: np.array([float(row[key]) for row in rows]) for key in rows[0] if "_mm" in key}
-    names = [["xx", "xy", "xz"], ["xy", "yy", "yz"], ["xz", "yz", "zz"]]
-    whole = np.stack([told[f"cov_{name}_mm2"] for name in sum(names, [])], 1).reshape(-1, 3, 3)
+    names = ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")
+    whole = np.stack([told[f"cov_{name}_mm2"] for name in names], 1).reshape(-1, 3, 3)
     np.testing.assert_allclose(whole, fit + geometry, atol=1e-5)
     for name, part in (("fit", fit), ("geometry", geometry)):
         largest = np.linalg.norm(part, 2, axis=(1, 2))
