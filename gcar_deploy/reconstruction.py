@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from gcar_deploy.config import RunOptions
+from gcar_deploy.flow import PressureDrop, doubts_of, pressure_drop, pressure_table
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.frame import OwnFrame
@@ -109,6 +110,12 @@ class Reconstruction:
         return measured(self.tree, self.views)
 
     @functools.cached_property
+    def pressure(self) -> PressureDrop:
+        """Pd/Pa along each branch at the usual assumed flow."""
+        doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches))
+        return pressure_drop(self.tree, self.measured.lumens, doubts=doubts)
+
+    @functools.cached_property
     def unexplained(self) -> tuple[Mask, ...]:
         """Per view (rows, cols) the pixels of its skeleton that no branch explains."""
         return tuple(unexplained(self.tree, view, self.options.quality) for view in self.views)
@@ -184,6 +191,7 @@ class Reconstruction:
                 "bifurcations": self._bifurcations(),
             },
             "ambiguity": self._ambiguity(),
+            "pressure": pressure_table(self.pressure),
             "volume": {
                 "center_mm": list(self.grid.center_mm),
                 "size_mm": list(self.grid.size_mm),
@@ -209,6 +217,9 @@ class Reconstruction:
                 reasons[path] = f"no name is as probable as {LEAST_CONFIDENCE:g}"
             if path.endswith(("/ghost_probability", "/ghost_share")):
                 reasons[path] = "known of two views with the predictor that sees both alone"
+            if path.startswith("/pressure/branches/"):
+                k = int(path.split("/")[3])
+                reasons[path] = body["pressure"]["branches"][k]["withheld"]
         if self.model is None:
             reasons["/model"] = "made without a model"
         if self.segmenter is None:

@@ -24,7 +24,7 @@ RUNTIME_FLOORS = (
     "gaussians dicom",
     "tree inputs",
     "predict tubes measure",
-    "quality",
+    "quality flow",
     "pose",
     "reconstruction steps",
     "output reconstruct selftest data",
@@ -42,7 +42,7 @@ FLOORS = {
     for room in rooms.split()
 }
 #: rooms that others enter by what their ``__init__`` shows
-FACED = ("models", "predict", "tubes", "quality", "pose")
+FACED = ("models", "predict", "tubes", "quality", "pose", "flow")
 #: what a bare ``import gcar_deploy`` or ``gcar --help`` must not load
 HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", "pydicom")
 #: the only files of the runtime that may name these libraries

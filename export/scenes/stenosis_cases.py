@@ -106,9 +106,12 @@ def thinned_label(path: Path, side: str) -> Tree:
 
 
 def with_stenosis(
-    name: str, vessels: tuple[Tube, ...], rng: np.random.Generator
+    name: str, vessels: tuple[Tube, ...], rng: np.random.Generator, percent: float | None = None
 ) -> StenosisCase | None:
-    """Narrow one vessel at a random place; None where no vessel has a place for it."""
+    """Narrow one vessel at a random place; None where no vessel has a place for it.
+
+    ``percent`` : diameter stenosis; None draws it from ``PERCENT``
+    """
     places = [
         (k, float(s))
         for k, vessel in enumerate(vessels)
@@ -118,7 +121,8 @@ def with_stenosis(
     if not places:
         return None
     k, middle = places[int(rng.integers(len(places)))]
-    vessel, percent, length = vessels[k], rng.uniform(*PERCENT), rng.uniform(*LENGTH_MM)
+    vessel, drawn, length = vessels[k], rng.uniform(*PERCENT), rng.uniform(*LENGTH_MM)
+    percent = drawn if percent is None else percent
     arc = vessel.arc_mm
     near = np.abs(arc - middle) <= length / 2 + HEALTHY_MM
     healthy = np.polyval(np.polyfit(arc[near], vessel.radius_mm[near], 1), arc)

@@ -8,9 +8,6 @@ from typing import Any
 
 import click
 
-#: a result.json is some tens of kilobytes
-_MAX_BYTES = 16 * 2**20
-
 
 @click.command("info")
 @click.argument("path", type=click.Path(path_type=Path), metavar="RESULT_DIR|MODEL")
@@ -32,7 +29,9 @@ def info(path: Path, as_json: bool) -> None:
         model = read_predictor(path)
         click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))
         return
-    summary = read_result(path)
+    from gcar_deploy.output.stored import read_summary
+
+    summary = read_summary(path)
     altered = altered_files(path, summary)
     if as_json:
         click.echo(json.dumps({**summary, "altered": altered}, allow_nan=False))
@@ -40,30 +39,6 @@ def info(path: Path, as_json: bool) -> None:
         click.echo("\n".join(lines(path, summary)))
     if altered:
         raise UsageError(f"{path}: not as it was written: {', '.join(altered)}")
-
-
-def read_result(path: Path) -> dict[str, Any]:
-    """Read the result.json of a folder.
-
-    Raises
-    ------
-    UsageError
-        There is none, or it is not of schema gcar-result/1.
-    """
-    from gcar_deploy.errors import UsageError
-
-    file = path / "result.json" if path.is_dir() else path
-    try:
-        if file.stat().st_size > _MAX_BYTES:
-            raise ValueError("too large")
-        summary = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{file} cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError):
-        raise UsageError(f"{file} is not a result.json") from None
-    if not isinstance(summary, dict) or summary.get("schema") != "gcar-result/1":
-        raise UsageError(f"{file} is not of schema gcar-result/1")
-    return summary
 
 
 def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 
 from gcar_deploy.errors import GcarError
+from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.types import Array
@@ -65,6 +66,9 @@ def report_html(
                 summary["tree"]["branches"], result.measured.hidden.tolist(), strict=True
             )
         ),
+        "PRESSURE": pressure_rows(summary),
+        "ASSUMED": html.escape(summary["pressure"]["sentence"]),
+        "CURVES": pressure_svg(result.pressure).replace(' xmlns="http://www.w3.org/2000/svg"', ""),
         "TIMINGS": _rows({k: f"{v:.2f} s" for k, v in summary["seconds"].items()}),
         "PROVENANCE": _rows(_provenance(summary)),
         "USE": html.escape(str(summary["use"])),
@@ -189,6 +193,26 @@ def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
         f'<tr data-branch="{row["branch"]}"><td class="swatch"></td>{columns}'
         '<td class="short">-</td></tr>'
     )
+
+
+def pressure_rows(summary: Mapping[str, Any]) -> str:
+    """One row a branch: Pd/Pa at its far end with the interval, or why it is withheld."""
+    out = []
+    titles = [branch_title(row) for row in summary["tree"]["branches"]]
+    for row, title in zip(summary["pressure"]["branches"], titles, strict=True):
+        cells = [title, f"{row['from_mm']:.0f} - {row['to_mm']:.0f}"]
+        cells.append("-" if row["flow_ml_min"] is None else f"{row['flow_ml_min']:.0f}")
+        line = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        if row["withheld"]:
+            told = f'<td colspan="3">withheld: {html.escape(row["withheld"])}</td>'
+        else:
+            low, high = row["interval"]
+            told = (
+                f"<td>{row['pd_pa']:.2f}</td><td>{low:.2f} - {high:.2f}</td>"
+                f"<td>{row['drop_mmhg']:.1f}</td>"
+            )
+        out.append(f"<tr>{line}{told}</tr>")
+    return "".join(out)
 
 
 def _sentences(summary: Mapping[str, Any]) -> list[str]:

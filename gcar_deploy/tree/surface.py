@@ -10,7 +10,7 @@ import numpy as np
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.tree.occupancy import capsule_distance, near_pairs
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Array, Points, Scalars
+from gcar_deploy.types import Array, Points
 
 #: lattice edge over the smallest radius, and its bounds, mm.
 EDGE_PER_RADIUS = 0.6
@@ -48,9 +48,9 @@ def lumen_surface(tree: Tree, edge_mm: float | None = None) -> Surface:
         return Surface(vertices_mm=np.zeros((0, 3)), faces=np.zeros((0, 3), np.int64))
     from skimage.measure import marching_cubes
 
-    lattice = _lattice(tree, edge_mm)
+    lattice = lumen_lattice(tree, edge_mm)
     edge = float(lattice.spacing_mm[0])
-    distance = _distance(tree.segments(), lattice, edge)
+    distance = lumen_distance(tree, lattice)
     # A vertex exactly on a lattice point would collapse triangles; nothing may be exactly 0.
     distance[np.abs(distance) < 1e-3 * edge] = 1e-3 * edge
     vertices, faces, _, _ = marching_cubes(
@@ -73,7 +73,8 @@ def stl_bytes(surface: Surface, title: str = "lumen, mm, LPS") -> bytes:
     return header + struct.pack("<I", len(corners)) + record.tobytes()
 
 
-def _lattice(tree: Tree, edge_mm: float | None) -> Grid:
+def lumen_lattice(tree: Tree, edge_mm: float | None) -> Grid:
+    """Lattice round a tree, as ``lumen_surface`` takes it."""
     radii = tree.radii()
     edge = edge_mm or float(np.clip(EDGE_PER_RADIUS * radii.min(), *EDGE_BOUNDS_MM))
     reach = float(radii.max()) + 2 * COARSEST_MM
@@ -90,11 +91,10 @@ def _lattice(tree: Tree, edge_mm: float | None) -> Grid:
     )
 
 
-def _distance(
-    capsules: tuple[Points, Points, Scalars, Scalars], lattice: Grid, edge: float
-) -> Array:
-    """(nx, ny, nz) float32 signed distance near the surface; a constant further outside."""
-    far = 2.0 * edge
+def lumen_distance(tree: Tree, lattice: Grid) -> Array:
+    """(nx, ny, nz) float32 signed distance near the surface, mm; a constant further outside."""
+    capsules = tree.segments()
+    far = 2.0 * float(lattice.spacing_mm[0])
     out = np.full(int(np.prod(lattice.shape)), far, np.float32)
     for start in range(0, len(capsules[0]), CHUNK):
         part = tuple(x[start : start + CHUNK] for x in capsules)

@@ -21,7 +21,8 @@ from pathlib import Path
 
 import click
 
-from gcar_deploy.cli.info import altered_files, read_result
+from gcar_deploy.cli.info import altered_files
+from gcar_deploy.output.stored import read_summary
 from tests.battery.cases import write_case
 
 _ROOT = Path(__file__).parents[2]
@@ -225,7 +226,7 @@ def _run(folder: Path, out: Path, *more: str) -> list[str]:
 def _whole(out: Path) -> list[str]:
     """Return what is wrong with a result folder: every listed file must be there as written."""
     try:
-        summary = read_result(out)
+        summary = read_summary(out)
         altered = altered_files(out, summary)
     except Exception as error:  # noqa: BLE001 - whatever it is, the folder is not whole
         return [f"half a result: {error}"]

@@ -1,0 +1,233 @@
+"""Pressure drop behind a stenosis against the same closed forms, or svZeroDSolver, on the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+
+from gcar_deploy.engine import Engine
+from gcar_deploy.errors import GcarError
+from gcar_deploy.flow import Assumption, PressureDrop, model_0d, pressure_drop
+from gcar_deploy.measure.lumen import branch_lumen
+from gcar_deploy.tree.tree import Tree
+from gcar_export.scenes.stenosis_cases import (
+    StenosisCase,
+    generated_tubes,
+    pictures,
+    with_stenosis,
+)
+from gcar_export.scenes.true_trees import joined_tree
+
+#: seeds of the trees: judged ones and those that constants are fitted to, both away from training
+JUDGED, FITTED = 9_100_000, 9_200_000
+#: Pd/Pa is compared so far behind a lesion, mm; a point of the truth counts so near, mm
+BEHIND_MM, NEAR_MM = 5.0, 2.0
+#: diameters are compared only so far from other vessels, mm
+CLEAR_MM = 4.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class FlowRow:
+    """One case.
+
+    Attributes
+    ----------
+    true_drop_mmhg, drop_mmhg : lost from the ostium to behind the lesion; None where that place
+        was not found
+    covered, covered_flow : whether the interval holds the truth at the assumed flow, and at a flow
+        drawn from the assumption's own spread
+    width : of the interval with both causes
+    withheld : why the product would give no value there
+    """
+
+    name: str
+    status: str
+    true_drop_mmhg: float
+    drop_mmhg: float | None = None
+    covered: bool = False
+    covered_flow: bool = False
+    width: float | None = None
+    withheld: str = ""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DiameterError:
+    """(n,) true and found diameters and healthy ones, mm, of clear points of one tree."""
+
+    true_mm: np.ndarray
+    found_mm: np.ndarray
+    healthy_mm: np.ndarray
+
+
+def flow_case(seed: int, percent: float) -> StenosisCase | None:
+    """Left tree of the generator with one stenosis of so many percent."""
+    rng = np.random.default_rng(seed)
+    return with_stenosis(f"generated {seed}", generated_tubes(seed), rng, percent)
+
+
+def flow_rows(
+    count: int, percent: float, fit: bool = False, on_case: Callable[[], None] | None = None
+) -> tuple[list[FlowRow], list[DiameterError]]:
+    """Make cases, reconstruct them, and compare pressure and diameters with the truth.
+
+    Parameters
+    ----------
+    fit : the trees that constants are fitted to, not those that they are judged on
+    """
+    engine, rows, errors = Engine(threads=1), [], []
+    for k in range(count):
+        seed = (FITTED if fit else JUDGED) + k
+        case = flow_case(seed, percent)
+        if case is not None:
+            try:
+                result = engine.reconstruct(*pictures(case))
+            except GcarError:
+                rows.append(FlowRow(name=case.name, status="refused", true_drop_mmhg=np.nan))
+            else:
+                rows.append(compare(case, result.tree, result.status, seed))
+                errors.append(diameters(case, result.tree))
+        if on_case is not None:
+            on_case()
+    return rows, errors
+
+
+def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
+    """Pd/Pa of a tree behind the true lesion, against that of the truth."""
+    place = _behind(case)
+    truth = joined_tree(case.vessels)
+    usual = Assumption()
+    true = _at(truth, told(truth, usual), place)
+    row = FlowRow(
+        name=case.name, status=status,
+        true_drop_mmhg=np.nan if true is None else (1 - true[0]) * usual.aortic_pressure_mmhg,
+    )  # fmt: skip
+    still = dataclasses.replace(usual, flow_sigma=0.0, split_sigma=0.0)
+    found, exact = _at(tree, told(tree, usual), place), _at(tree, told(tree, still), place)
+    if true is None or found is None or exact is None:
+        return row
+    rng = np.random.default_rng(seed)
+    drawn = dataclasses.replace(
+        usual,
+        velocity_m_s=usual.velocity_m_s
+        * float(np.exp(np.log1p(usual.relative_flow_sigma) * rng.standard_normal())),
+        split_exponent=usual.split_exponent + usual.split_sigma * float(rng.standard_normal()),
+    )
+    other = _at(truth, told(truth, drawn), place)
+    return dataclasses.replace(
+        row,
+        drop_mmhg=(1 - found[0]) * usual.aortic_pressure_mmhg,
+        covered=exact[1] <= true[0] <= exact[2],
+        covered_flow=other is not None and found[1] <= other[0] <= found[2],
+        width=found[2] - found[1],
+        withheld=found[3],
+    )
+
+
+def told(tree: Tree, assumed: Assumption) -> PressureDrop:
+    """Pressure drop of a tree."""
+    return pressure_drop(tree, [branch_lumen(b) for b in tree.branches], assumed)
+
+
+def diameters(case: StenosisCase, tree: Tree) -> DiameterError:
+    """Compare diameters where one vessel alone is near."""
+    own = np.concatenate([np.full(len(v.points_mm), k) for k, v in enumerate(case.vessels)])
+    points = np.concatenate([v.points_mm for v in case.vessels])
+    radii = np.concatenate([v.radius_mm for v in case.vessels])
+    lookup = cKDTree(points)
+    gap, at = lookup.query(tree.points())
+    clear = np.array([
+        g <= 0.5 * NEAR_MM and len(set(own[near])) == 1
+        for g, near in zip(gap, lookup.query_ball_point(tree.points(), CLEAR_MM), strict=True)
+    ])  # fmt: skip
+    healthy = np.concatenate([branch_lumen(b).healthy_mm for b in tree.branches])
+    return DiameterError(
+        true_mm=2 * radii[at][clear], found_mm=2 * tree.radii()[clear], healthy_mm=healthy[clear]
+    )
+
+
+def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float]:
+    """Floor, share and narrowing of ``flow.spread`` that make the errors likeliest (Gaussian)."""
+    true, found, healthy = (
+        np.concatenate([getattr(e, name) for e in errors])
+        for name in ("true_mm", "found_mm", "healthy_mm")
+    )
+    narrow = np.maximum(np.nan_to_num(healthy - found), 0.0)
+
+    def cost(log: np.ndarray) -> float:
+        floor, share, narrowing = np.exp(log)
+        variance = floor**2 + (share * found) ** 2 + (narrowing * narrow) ** 2
+        return float(np.mean(0.5 * np.log(variance) + 0.5 * (found - true) ** 2 / variance))
+
+    best = minimize(cost, np.log([0.1, 0.05, 0.1]), method="Nelder-Mead")
+    floor, share, narrowing = np.exp(best.x)
+    return float(floor), float(share), float(narrowing)
+
+
+def solver_gap(tree: Tree, drop: PressureDrop) -> float:
+    """Largest relative difference of flow or pressure from svZeroDSolver's, over all branches."""
+    import svzerod
+
+    found = svzerod.simulate(model_0d(tree, drop))
+    last = found[found["time"] == found["time"].max()].set_index("name")
+    gaps = []
+    for k in drop.network.order:
+        vessel = drop.vessels[k]
+        names = [name for name in last.index if name.startswith(f"branch{k + 1}_seg")]
+        pressure = 10 * drop.assumed.aortic_pressure_pa * vessel.ratio
+        for ours, theirs in (
+            (pressure[0], last.loc[names[0], "pressure_in"]),
+            (pressure[-1], last.loc[names[-1], "pressure_out"]),
+            (vessel.flow_m3_s * 1e6, last.loc[names[0], "flow_in"]),
+        ):
+            gaps.append(abs(ours / theirs - 1))
+    return float(max(gaps))
+
+
+def table(rows: Sequence[FlowRow]) -> str:
+    """Markdown of errors and coverage."""
+    seen = [row for row in rows if row.drop_mmhg is not None]
+    if not seen:
+        return f"{len(rows)} cases, no lesion found"
+    share = np.array([(r.drop_mmhg or 0.0) / r.true_drop_mmhg - 1 for r in seen])
+    n = len(seen)
+    within = int((np.abs(share) <= 0.1).sum())
+    held = sum(bool(r.withheld) for r in seen)
+    return "\n".join([
+        "| figure | value |", "|---|---|",
+        f"| true pressure drop, median | {np.median([r.true_drop_mmhg for r in seen]):.1f} mmHg |",
+        f"| relative error, mean ± SD | {share.mean():+.0%} ± {share.std():.0%} |",
+        f"| relative error, median of absolute | {np.median(np.abs(share)):.0%} |",
+        f"| within 10 % | {within} of {n} |",
+        f"| interval covers, flow as assumed | {sum(r.covered for r in seen)} of {n} |",
+        f"| interval covers, flow drawn | {sum(r.covered_flow for r in seen)} of {n} |",
+        f"| width of the interval, median | {np.median([r.width or 0.0 for r in seen]):.2f} |",
+        f"| value withheld | {held} of {n} |", "",
+        f"{len(rows)} cases, {sum(r.status == 'refused' for r in rows)} refused, "
+        f"{len(rows) - n} without the lesion",
+    ])  # fmt: skip
+
+
+def _behind(case: StenosisCase) -> np.ndarray:
+    """(3,) the place behind the lesion."""
+    vessel, lesion = case.vessels[case.lesion.vessel], case.lesion
+    at = min(lesion.middle_mm + lesion.length_mm / 2 + BEHIND_MM, vessel.arc_mm[-1])
+    return np.array([np.interp(at, vessel.arc_mm, column) for column in vessel.points_mm.T])
+
+
+def _at(
+    tree: Tree, drop: PressureDrop, place: np.ndarray
+) -> tuple[float, float, float, str] | None:
+    """Pd/Pa, interval and reason at the point nearest to a place; None where none is near."""
+    best: tuple[float, tuple[float, float, float, str]] | None = None
+    for branch, vessel in zip(tree.branches, drop.vessels, strict=True):
+        gap = np.linalg.norm(branch.points_mm - place, axis=1)
+        k = int(np.argmin(gap))
+        if gap[k] <= NEAR_MM and np.isfinite(vessel.ratio[k]) and (not best or gap[k] < best[0]):
+            held = "" if vessel.told[k] else (vessel.withheld or "too wide")
+            ends = (float(x[k]) for x in (vessel.ratio, vessel.low, vessel.high))
+            best = float(gap[k]), (*ends, held)
+    return None if best is None else best[1]

@@ -1,0 +1,79 @@
+"""How far diameters may be off, and trees drawn with such errors.
+
+The standard deviation of a diameter grows with the diameter and with how narrow the vessel is
+against its healthy width, since narrow cores are smoothed over:
+
+    sigma^2 = FLOOR^2 + (SHARE d)^2 + (NARROW (healthy - d))^2.
+
+Errors along a vessel go together. A part is common to a branch (calibration, threshold), the rest
+changes over ``REACH_MM``. The constants are fitted to generated trees by ``gcar-export flow-table
+--fit``, and judged on others.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gcar_deploy.measure.lumen import BranchLumen
+from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.types import Array, Scalars
+
+FLOOR_MM, SHARE, NARROW = 0.08, 0.05, 0.15
+#: share of the variance that is common to a branch, and how far the rest reaches along it, mm
+COMMON, REACH_MM = 0.3, 4.0
+#: a diameter is known to a factor of this at worst; a wider spread says nothing more
+_MOST_LOG = 0.5
+
+
+def diameter_sigma_mm(branch: Branch, lumen: BranchLumen) -> Scalars:
+    """(m,) standard deviation of the diameter at each point of a branch, mm."""
+    d = 2.0 * branch.radius_mm
+    narrowing = np.maximum(np.nan_to_num(lumen.healthy_mm - d), 0.0)
+    out: Scalars = np.sqrt(FLOOR_MM**2 + (SHARE * d) ** 2 + (NARROW * narrowing) ** 2)
+    return out
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Draws:
+    """Errors of the log diameter.
+
+    Attributes
+    ----------
+    points : (samples, points) of each point of ``tree.points()``
+    branches : (samples, branches) of each branch's calibre
+    """
+
+    points: Array
+    branches: Array
+
+
+def draw(tree: Tree, sigma_mm: Scalars, samples: int, rng: np.random.Generator) -> Draws:
+    """Draw trees as they may be.
+
+    Parameters
+    ----------
+    tree : Tree
+    sigma_mm : (n,) of the diameter at each of its points
+    samples : how many
+    """
+    owner = tree.branch_index()
+    n = len(tree.branches)
+    relative = np.minimum(sigma_mm / (2.0 * tree.radii()), _MOST_LOG)
+    common = rng.standard_normal((samples, n))
+    # A value every REACH_MM, a straight line between: neighbours go together, and draws are few.
+    knot, share, count = [], [], 0
+    for branch in tree.branches:
+        at = branch.arc_mm / REACH_MM
+        knot.append(count + np.floor(at).astype(int))
+        share.append(at - np.floor(at))
+        count += int(np.floor(at[-1])) + 2
+    k, t = np.concatenate(knot), np.concatenate(share)
+    own = rng.standard_normal((samples, count))
+    # The mean of two values scatters less than either.
+    local = (own[:, k] * (1 - t) + own[:, k + 1] * t) / np.sqrt((1 - t) ** 2 + t**2)
+    z = np.sqrt(COMMON) * common[:, owner] + np.sqrt(1 - COMMON) * local
+    points = z * relative
+    of_branch = np.array([relative[owner == b].mean() for b in range(n)])
+    return Draws(points=points, branches=np.sqrt(COMMON) * common * of_branch)
