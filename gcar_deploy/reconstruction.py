@@ -113,7 +113,8 @@ class Reconstruction:
     def pressure(self) -> PressureDrop:
         """Pd/Pa along each branch at the usual assumed flow."""
         doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches))
-        return pressure_drop(self.tree, self.measured.lumens, doubts=doubts)
+        names = [None if name is None else name.name for name in self.names]
+        return pressure_drop(self.tree, self.measured.lumens, doubts=doubts, names=names)
 
     @functools.cached_property
     def unexplained(self) -> tuple[Mask, ...]:

@@ -81,7 +81,9 @@ def flow(
     stored = read_folder(result)
     tree, told = stored.tree, stored.summary
     doubts = doubts_of(told["status"], told["sentence"], len(tree.branches))
-    drop = pressure_drop(tree, [branch_lumen(b) for b in tree.branches], assumed, doubts)
+    names = [branch.get("name") for branch in told["tree"]["branches"]]
+    lumens = [branch_lumen(branch) for branch in tree.branches]
+    drop = pressure_drop(tree, lumens, assumed, doubts, names)
     table = pressure_table(drop)
     if out is not None:
         from gcar_deploy.output.handover import write_handover
@@ -91,7 +93,6 @@ def flow(
     if talk.as_json:
         click.echo(json.dumps(table, allow_nan=False))
     else:
-        names = [branch.get("name") for branch in told["tree"]["branches"]]
         click.echo("\n".join([*([] if out is None else [str(out)]), *lines(table, names)]))
 
 

@@ -48,29 +48,40 @@ class Network:
         return tuple(k for k in self.order if not self.children[k])
 
 
-def network_of(tree: Tree, lumens: Sequence[BranchLumen]) -> Network:
+#: main vessels that begin at an ostium
+_OSTIAL = ("LM", "RCA")
+
+
+def network_of(
+    tree: Tree, lumens: Sequence[BranchLumen], names: Sequence[str | None] = ()
+) -> Network:
     """Tell who feeds whom.
 
-    The longest component is the artery. Others have lost their way to it, so that no flow can be
-    told in them; nor can it downstream of a loop.
+    The longest component is an artery, and so is one that a left main or right coronary artery
+    begins. Others have lost their way to theirs, so that no flow can be told in them; nor can it
+    downstream of a loop.
 
     Parameters
     ----------
     tree : Tree, branches from their inlets (``measure.inlet``)
     lumens : its branches' lumens
+    names : of its branches; empty where none is known
     """
     n = len(tree.branches)
     feeding: dict[int, list[int]] = {}
     for k, branch in enumerate(tree.branches):
         feeding.setdefault(branch.end, []).append(k)
     component = tree.components() if n else np.zeros(0, int)
-    main = component[tree.branches[0].start] if n else 0
+    arteries = {component[b.start] for b in tree.branches[:1]}
+    for branch, name in zip(tree.branches, names, strict=bool(names)):
+        if name in _OSTIAL and branch.start not in feeding:
+            arteries.add(component[branch.start])
     parent: list[int | None] = [None] * n
     left_out: dict[int, str] = {}
     for k, branch in enumerate(tree.branches):
         fed_by = [j for j in feeding.get(branch.start, ()) if j != k]
-        if component[branch.start] != main:
-            left_out[k] = "it is not joined to the artery's inlet"
+        if component[branch.start] not in arteries:
+            left_out[k] = "it is not joined to an artery's inlet"
         elif len(fed_by) > 1 or branch.start == branch.end:
             left_out[k] = "the tree has a loop there"
         elif fed_by:
@@ -104,7 +115,9 @@ def calibre_mm(branch: Branch, lumen: BranchLumen) -> float:
     if not len(known):
         return float(2.0 * np.median(branch.radius_mm))
     near = known[branch.arc_mm[known] <= branch.arc_mm[known[0]] + CALIBRE_MM]
-    return float(np.median(lumen.healthy_mm[near]))
+    # In a short branch that is mostly lesion, the reference line is too low itself.
+    wide = np.quantile(2.0 * branch.radius_mm[near], 0.75)
+    return float(max(np.median(lumen.healthy_mm[near]), wide))
 
 
 def flows(

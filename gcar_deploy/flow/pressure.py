@@ -98,6 +98,7 @@ def pressure_drop(
     lumens: Sequence[BranchLumen],
     assumed: Assumption | None = None,
     doubts: Mapping[int, str] | None = None,
+    names: Sequence[str | None] = (),
 ) -> PressureDrop:
     """Work out Pd/Pa.
 
@@ -107,9 +108,10 @@ def pressure_drop(
     lumens : its branches' lumens, for the healthy diameter and how narrow the vessel is
     assumed : Assumption; None takes the usual one
     doubts : branch -> why nothing may be said of it and of what lies behind it
+    names : of its branches, which tell a second artery from a piece that was torn off
     """
     assumed = assumed or Assumption()
-    network = network_of(tree, lumens)
+    network = network_of(tree, lumens, names)
     if not tree.branches:
         return PressureDrop(assumed=assumed, network=network, vessels=())
     rng = np.random.default_rng(assumed.seed)

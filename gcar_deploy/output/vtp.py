@@ -1,4 +1,4 @@
-"""XML PolyData for VMTK, ParaView and 3D Slicer: points and polylines with their data."""
+"""XML PolyData for VMTK, ParaView and 3D Slicer: points, polylines, triangles with their data."""
 
 from __future__ import annotations
 
@@ -30,14 +30,40 @@ def poly_data(
     """
     count, kind = len(points_mm), "Verts" if sizes is None else "Lines"
     ends = np.arange(1, count + 1) if sizes is None else np.cumsum(np.asarray(sizes, np.int64))
-    cells = dict.fromkeys(("Verts", "Lines", "Strips", "Polys"), 0) | {kind: len(ends)}
+    return _file(points_mm, (kind, np.arange(count, dtype=np.int64), ends), point_data, cell_data)
+
+
+def triangle_data(
+    vertices_mm: Points, faces: Array, cell_data: Mapping[str, Array | Sequence[str]]
+) -> bytes:
+    """Write triangles as a VTP file.
+
+    Parameters
+    ----------
+    vertices_mm : (v, 3) mm LPS
+    faces : (f, 3) vertex numbers
+    cell_data : name -> one number or text (ASCII) for each triangle
+    """
+    ends = 3 * np.arange(1, len(faces) + 1)
+    return _file(vertices_mm, ("Polys", faces.reshape(-1), ends), {}, cell_data)
+
+
+def _file(
+    points_mm: Points,
+    cells: tuple[str, Array, Array],
+    point_data: Mapping[str, Array],
+    cell_data: Mapping[str, Array | Sequence[str]],
+) -> bytes:
+    """XML of points and cells: their kind, the points they join, and where each ends."""
+    kind, joined, ends = cells
+    counts = dict.fromkeys(("Verts", "Lines", "Strips", "Polys"), 0) | {kind: len(ends)}
     active = f' Scalars="{next(iter(point_data))}"' if point_data else ""
     out = [
         '<?xml version="1.0"?>',
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32">',
         "<PolyData>",
-        f'<Piece NumberOfPoints="{count}" '
-        + " ".join(f'NumberOf{name}="{many}"' for name, many in cells.items())
+        f'<Piece NumberOfPoints="{len(points_mm)}" '
+        + " ".join(f'NumberOf{name}="{many}"' for name, many in counts.items())
         + ">",
         f"<PointData{active}>",
         *(
@@ -52,7 +78,7 @@ def poly_data(
         _data_array("Points", np.asarray(points_mm, np.float64).reshape(-1, 3), components=3),
         "</Points>",
         f"<{kind}>",
-        _data_array("connectivity", np.arange(count, dtype=np.int64)),
+        _data_array("connectivity", joined.astype(np.int64)),
         _data_array("offsets", ends.astype(np.int64)),
         f"</{kind}>",
         "</Piece>",
