@@ -226,8 +226,10 @@ def _at(
     for branch, vessel in zip(tree.branches, drop.vessels, strict=True):
         gap = np.linalg.norm(branch.points_mm - place, axis=1)
         k = int(np.argmin(gap))
-        if gap[k] <= NEAR_MM and np.isfinite(vessel.ratio[k]) and (not best or gap[k] < best[0]):
+        width = float(branch.radius_mm[k])
+        # Of several the widest: twigs run beside the vessel for a while.
+        if gap[k] <= NEAR_MM and np.isfinite(vessel.ratio[k]) and (not best or width > best[0]):
             held = "" if vessel.told[k] else (vessel.withheld or "too wide")
             ends = (float(x[k]) for x in (vessel.ratio, vessel.low, vessel.high))
-            best = float(gap[k]), (*ends, held)
+            best = width, (*ends, held)
     return None if best is None else best[1]

@@ -34,9 +34,10 @@ class Assumption:
     aortic_pressure_mmhg : mean pressure Pa at the inlet, mmHg
     flow_sigma : relative standard deviation of the inlet flow; None takes 0.2 with a velocity,
         0 with a given flow
-    inlet_exponent, split_exponent, split_sigma : flow goes by diameter to these powers (Taylor et
-        al., Front Physiol 13:871912, 2022), between several inlets and at a bifurcation; sigma of
-        the second so that the first is a likely value of it
+    inlet_exponent, split_exponent : flow goes by diameter to these powers (Taylor et al., Front
+        Physiol 13:871912, 2022), between several inlets and at a bifurcation
+    split_sigma : standard deviation of the log of what a branch draws beside its sisters: patients
+        differ, and branches are missed or made up
     density_kg_m3, viscosity_pa_s : blood, Newtonian
     coverage : share of cases that an interval is to hold
     samples, seed : of the Monte Carlo run
@@ -48,7 +49,7 @@ class Assumption:
     flow_sigma: float | None = None
     inlet_exponent: float = 2.15
     split_exponent: float = 2.38
-    split_sigma: float = 0.2
+    split_sigma: float = 0.5
     density_kg_m3: float = 1060.0
     viscosity_pa_s: float = 0.0035
     coverage: float = 0.9
@@ -84,6 +85,6 @@ class Assumption:
         )
         return (
             f"Assumed: {flow} (SD {self.relative_flow_sigma:.0%}), split by diameter^"
-            f"{self.split_exponent:g} (SD {self.split_sigma:g}), Pa {self.aortic_pressure_mmhg:g} "
+            f"{self.split_exponent:g} (SD of a share {self.split_sigma:.0%}), Pa {self.aortic_pressure_mmhg:g} "
             f"mmHg, rigid round vessels, steady flow. Not measured; not a fractional flow reserve."
         )

@@ -27,6 +27,7 @@ class Network:
     order : every branch after its parent
     left_out : branch -> why no flow can be told through it
     calibre_mm : (branches,) healthy diameter that flow goes by
+    draw : (branches,) share of its calibre's flow that a branch draws, below 1 for short free ends
     from_mm : (branches,) distance of each branch's inlet from the ostium
     """
 
@@ -35,6 +36,7 @@ class Network:
     order: tuple[int, ...]
     left_out: dict[int, str]
     calibre_mm: Scalars
+    draw: Scalars
     from_mm: Scalars
 
     @property
@@ -48,6 +50,8 @@ class Network:
         return tuple(k for k in self.order if not self.children[k])
 
 
+#: a free piece draws flow by its length up to so much, mm: short ones are often no vessel
+FULL_MM = 20.0
 #: main vessels that begin at an ostium
 _OSTIAL = ("LM", "RCA")
 
@@ -102,6 +106,10 @@ def network_of(
     return Network(
         parent=tuple(parent), children=children, order=tuple(order), left_out=left_out,
         calibre_mm=np.array([calibre_mm(*pair) for pair in zip(tree.branches, lumens, strict=True)]),
+        draw=np.array([
+            1.0 if below else min(branch.length_mm / FULL_MM, 1.0)
+            for branch, below in zip(tree.branches, children, strict=True)
+        ]),
         from_mm=from_mm,
     )  # fmt: skip
 
@@ -121,14 +129,14 @@ def calibre_mm(branch: Branch, lumen: BranchLumen) -> float:
 
 
 def flows(
-    network: Network, calibre_mm: Array, split_exponent: Array, assumed: Assumption
+    network: Network, calibre_mm: Array, draw: Array, assumed: Assumption
 ) -> Array:
     """Flow through each branch; what enters a bifurcation leaves it.
 
     Parameters
     ----------
     calibre_mm : (..., branches) diameters that flow goes by
-    split_exponent : (...) at bifurcations
+    draw : (..., branches) factor on what each draws beside its sisters
     assumed : Assumption; inlet flow without its spread
 
     Returns
@@ -149,6 +157,6 @@ def flows(
     for k in network.order:
         below = list(network.children[k])
         if below:
-            share = calibre_mm[..., below] ** np.asarray(split_exponent)[..., None]
+            share = draw[..., below] * calibre_mm[..., below] ** assumed.split_exponent
             out[..., below] = out[..., [k]] * share / share.sum(axis=-1, keepdims=True)
     return out

@@ -19,7 +19,7 @@ from gcar_deploy.flow.assumption import (
 )
 from gcar_deploy.flow.hydraulics import expansion_loss, expansions, piece_resistance
 from gcar_deploy.flow.network import Network, flows, network_of
-from gcar_deploy.flow.spread import Draws, diameter_sigma_mm, draw
+from gcar_deploy.flow.spread import Draws, draw
 from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
@@ -115,22 +115,19 @@ def pressure_drop(
     if not tree.branches:
         return PressureDrop(assumed=assumed, network=network, vessels=())
     rng = np.random.default_rng(assumed.seed)
-    sigma = np.concatenate(
-        [diameter_sigma_mm(b, lumen) for b, lumen in zip(tree.branches, lumens, strict=True)]
-    )
-    draws = draw(tree, sigma, assumed.samples, rng)
-    z = rng.standard_normal((2, assumed.samples))
+    draws = draw(tree, lumens, assumed.samples, rng)
     # A log-normal flow whose median is the flow assumed.
-    scale = np.exp(z[0] * np.log1p(assumed.relative_flow_sigma))
-    exponent = assumed.split_exponent + z[1] * assumed.split_sigma
-    still = Draws(points=np.zeros((1, sigma.size)), branches=np.zeros((1, len(tree.branches))))
+    scale = np.exp(rng.standard_normal(assumed.samples) * np.log1p(assumed.relative_flow_sigma))
+    shape = assumed.samples, len(tree.branches)
+    share = np.exp(rng.standard_normal(shape) * np.log1p(assumed.split_sigma))
     model = _Model(tree, network, assumed)
-    usual = np.full(assumed.samples, assumed.split_exponent)
+    still = model.still
+    one = np.ones(shape)
     cases = {
-        "nominal": model.ratios(still, np.ones(1), usual[:1]),
-        "diameter": model.ratios(draws, np.ones(assumed.samples), usual),
-        "flow": model.ratios(still, scale, exponent),
-        "both": model.ratios(draws, scale, exponent),
+        "nominal": model.ratios(still, one[:1, 0], one[:1]),
+        "diameter": model.ratios(draws, one[:, 0], one),
+        "flow": model.ratios(still, scale, share),
+        "both": model.ratios(draws, scale, share),
     }
     return PressureDrop(
         assumed=assumed, network=network, vessels=_vessels(tree, model, cases, doubts or {})
@@ -154,6 +151,8 @@ class _Model:
         # From one branch to the next there is no vessel.
         self.length_mm[np.diff(self.owner) > 0] = 0.0
         sizes = [len(branch) for branch in tree.branches]
+        #: the tree as it was measured
+        self.still = Draws(points=np.zeros((1, sum(sizes))), branches=np.zeros((1, len(sizes))))
         self.last = np.cumsum(sizes) - 1
         self.first = self.last - np.array(sizes) + 1
         self.expansions = [
@@ -162,11 +161,12 @@ class _Model:
             for e in expansions(branch.radius_mm)
         ]
 
-    def flows(self, draws: Draws, scale: Array, exponent: Array) -> Array:
+    def flows(self, draws: Draws, scale: Array, share: Array) -> Array:
         """(s, branches) flow in each draw, m^3 / s."""
         calibre = self.network.calibre_mm * np.exp(draws.branches)
-        calibre = np.broadcast_to(calibre, (len(scale), calibre.shape[1]))
-        return flows(self.network, calibre, exponent, self.assumed) * scale[:, None]
+        calibre = np.broadcast_to(calibre, share.shape)
+        draw = share * self.network.draw
+        return flows(self.network, calibre, draw, self.assumed) * scale[:, None]
 
     def losses(self, draws: Draws, flow: Array) -> Array:
         """(s, points) pressure lost since the inlet of each point's branch, Pa."""
@@ -184,9 +184,9 @@ class _Model:
         total = np.cumsum(step, axis=1)
         return total - total[:, self.first[self.owner]]
 
-    def ratios(self, draws: Draws, scale: Array, exponent: Array) -> Array:
+    def ratios(self, draws: Draws, scale: Array, share: Array) -> Array:
         """(s, points) Pd/Pa; NaN in branches left out."""
-        flow = self.flows(draws, scale, exponent)
+        flow = self.flows(draws, scale, share)
         lost = self.losses(draws, flow)
         before = np.full(flow.shape, np.nan)
         for k in self.network.order:
@@ -206,8 +206,7 @@ def _vessels(
         name: np.quantile(cases[name][:, model.last], [tail, 1.0 - tail], axis=0)
         for name in ("diameter", "flow")
     }
-    still = Draws(points=np.zeros((1, len(model.owner))), branches=np.zeros((1, len(model.last))))
-    flow = model.flows(still, np.ones(1), np.full(1, assumed.split_exponent))[0]
+    flow = model.flows(model.still, np.ones(1), np.ones((1, len(tree.branches))))[0]
     nominal = cases["nominal"][0]
     inherited = dict(doubts)
     for k in network.order:

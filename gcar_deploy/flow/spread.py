@@ -1,18 +1,20 @@
 """How far diameters may be off, and trees drawn with such errors.
 
 The standard deviation of a diameter grows with the diameter and with how narrow the vessel is
-against its healthy width, since narrow cores are smoothed over:
+against its healthy width, and on average a narrow core comes out too wide, since it is smoothed
+over:
 
-    sigma^2 = FLOOR^2 + (SHARE d)^2 + (NARROW (healthy - d))^2.
+    sigma^2 = FLOOR^2 + (SHARE d)^2 + (NARROW n)^2,  mean = d - LOST n,  n = healthy - d.
 
 Errors along a vessel go together. A part is common to a branch (calibration, threshold), the rest
 changes over ``REACH_MM``. The constants are fitted to generated trees by ``gcar-export flow-table
---fit``, and judged on others.
+--fit``, and judged on others; they belong to the present fit of the lumen.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
-FLOOR_MM, SHARE, NARROW = 0.08, 0.05, 0.15
+FLOOR_MM, SHARE, NARROW, LOST = 0.12, 0.04, 0.12, 0.1
 #: share of the variance that is common to a branch, and how far the rest reaches along it, mm
 COMMON, REACH_MM = 0.3, 4.0
 #: a diameter is known to a factor of this at worst; a wider spread says nothing more
@@ -30,8 +32,15 @@ _MOST_LOG = 0.5
 def diameter_sigma_mm(branch: Branch, lumen: BranchLumen) -> Scalars:
     """(m,) standard deviation of the diameter at each point of a branch, mm."""
     d = 2.0 * branch.radius_mm
-    narrowing = np.maximum(np.nan_to_num(lumen.healthy_mm - d), 0.0)
-    out: Scalars = np.sqrt(FLOOR_MM**2 + (SHARE * d) ** 2 + (NARROW * narrowing) ** 2)
+    out: Scalars = np.sqrt(
+        FLOOR_MM**2 + (SHARE * d) ** 2 + (NARROW * narrowing_mm(branch, lumen)) ** 2
+    )
+    return out
+
+
+def narrowing_mm(branch: Branch, lumen: BranchLumen) -> Scalars:
+    """(m,) how much narrower than its healthy diameter a branch is, mm; 0 where none is known."""
+    out: Scalars = np.maximum(np.nan_to_num(lumen.healthy_mm - 2.0 * branch.radius_mm), 0.0)
     return out
 
 
@@ -49,15 +58,20 @@ class Draws:
     branches: Array
 
 
-def draw(tree: Tree, sigma_mm: Scalars, samples: int, rng: np.random.Generator) -> Draws:
+def draw(
+    tree: Tree, lumens: Sequence[BranchLumen], samples: int, rng: np.random.Generator
+) -> Draws:
     """Draw trees as they may be.
 
     Parameters
     ----------
-    tree : Tree
-    sigma_mm : (n,) of the diameter at each of its points
+    tree : Tree with a branch
+    lumens : of its branches
     samples : how many
     """
+    pairs = list(zip(tree.branches, lumens, strict=True))
+    sigma_mm = np.concatenate([diameter_sigma_mm(*pair) for pair in pairs])
+    lost = LOST * np.concatenate([narrowing_mm(*pair) for pair in pairs])
     owner = tree.branch_index()
     n = len(tree.branches)
     relative = np.minimum(sigma_mm / (2.0 * tree.radii()), _MOST_LOG)
@@ -74,6 +88,7 @@ def draw(tree: Tree, sigma_mm: Scalars, samples: int, rng: np.random.Generator) 
     # The mean of two values scatters less than either.
     local = (own[:, k] * (1 - t) + own[:, k + 1] * t) / np.sqrt((1 - t) ** 2 + t**2)
     z = np.sqrt(COMMON) * common[:, owner] + np.sqrt(1 - COMMON) * local
-    points = z * relative
+    centre = np.log1p(-np.minimum(lost / (2.0 * tree.radii()), _MOST_LOG))
+    points = centre + z * relative
     of_branch = np.array([relative[owner == b].mean() for b in range(n)])
     return Draws(points=points, branches=np.sqrt(COMMON) * common * of_branch)

@@ -130,30 +130,31 @@ def test_either_cause_alone_is_narrower_than_both():
 
 
 def test_draws_have_the_stated_sigma():
-    tree = straight(np.linspace(1.8, 1.2, 121))
-    sigma = np.full(121, 0.1)
-    drawn = draw(tree, sigma, 4000, np.random.default_rng(0)).points
+    tree = stenosed(50.0, count=61)
+    own = tree.branches[0]
+    lumen = branch_lumen(own)
+    sigma = diameter_sigma_mm(own, lumen)
+    drawn = draw(tree, [lumen], 4000, np.random.default_rng(0)).points
     np.testing.assert_allclose(drawn.std(axis=0), sigma / (2 * tree.radii()), rtol=0.08)
+    # Narrow cores come out too wide: what may be there is narrower.
+    assert drawn[:, 30].mean() < -0.03 and abs(drawn[:, 5].mean()) < 0.01
 
 
 def test_intervals_hold_the_truth_nine_times_in_ten():
-    """Trees measured with errors of the stated size: nothing here is fitted to the answer."""
+    """True trees that scatter about the measured one as stated, at a flow that is known."""
     covered = 0
     rng = np.random.default_rng(7)
+    known = {"flow_ml_min": 150.0}
     for k in range(100):
-        true = stenosed(rng.uniform(20, 55), rng.uniform(1.3, 1.9))
-        lumen = branch_lumen(true.branches[0])
-        sigma = diameter_sigma_mm(true.branches[0], lumen)
-        off = draw(true, sigma, 1, np.random.default_rng(1000 + k)).points[0]
-        own = true.branches[0]
-        seen = dataclasses.replace(own, radius_mm=own.radius_mm * np.exp(off))
-        assumed = Assumption(flow_sigma=0.0, flow_ml_min=150.0)
-        found = drop_of(
-            dataclasses.replace(true, branches=(seen,)), flow_sigma=0.0, flow_ml_min=150.0
-        ).vessels[0]
-        truth = pressure_drop(true, [lumen], assumed).vessels[0].ratio[-1]
+        seen = stenosed(rng.uniform(20, 55), rng.uniform(1.3, 1.9), count=81)
+        own = seen.branches[0]
+        off = draw(seen, [branch_lumen(own)], 1, np.random.default_rng(1000 + k)).points[0]
+        true = dataclasses.replace(own, radius_mm=own.radius_mm * np.exp(off))
+        found = drop_of(seen, **known).vessels[0]
+        truth = drop_of(dataclasses.replace(seen, branches=(true,)), **known).vessels[0].ratio[-1]
         covered += bool(found.low[-1] <= truth <= found.high[-1])
-    assert covered >= 83  # 90 expected; 83 is three standard deviations of a binomial less
+    # 90 expected; three standard deviations of a binomial either way.
+    assert 81 <= covered <= 99
 
 
 @pytest.mark.parametrize(
