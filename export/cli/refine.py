@@ -90,3 +90,22 @@ def sigma_table(seed: int, trees: int, protocols: str, predictors: str, parts: b
             )
             rows += made if parts else made[-1:]
     click.echo(sigma.table(rows))
+
+
+@click.command("flow-table")
+@click.option("--count", default=20, show_default=True, help="Generated trees.")
+@click.option("--percent", default=60.0, show_default=True, help="Diameter stenosis of each.")
+@click.option("--fit", is_flag=True, help="Print constants fitted to other trees instead.")
+def flow_table(count: int, percent: float, fit: bool) -> None:
+    """Compare the pressure drop behind a stenosis with that of the true lumen.
+
+    Example: gcar-export flow-table --count 100
+    """
+    from gcar_export.studies import flow_table as flow
+
+    with click.progressbar(length=count, label="trees", file=sys.stderr) as bar:
+        rows, errors = flow.flow_rows(count, percent, fit, lambda: bar.update(1))
+    if fit:
+        floor, share, narrow, lost = flow.fitted(errors)
+        click.echo(f"FLOOR_MM {floor:.3f}, SHARE {share:.3f}, NARROW {narrow:.3f}, LOST {lost:.3f}")
+    click.echo(flow.table(rows))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,7 +46,7 @@ def joined_tree(vessels: Sequence[Tube]) -> Tree:
     branches = []
     for k, vessel in enumerate(vessels):
         ends = sorted(cuts[k])
-        for a, b in zip(ends[:-1], ends[1:], strict=True):
+        for a, b in itertools.pairwise(ends):
             points = vessel.points_mm[a : b + 1].copy()
             points[0] = nodes[number[k, a]]
             count = b + 1 - a

@@ -38,7 +38,7 @@ class FlowRow:
     ----------
     true_drop_mmhg, drop_mmhg : lost from the ostium to behind the lesion; None where that place
         was not found
-    covered, covered_flow : whether the interval holds the truth at the assumed flow, and at a flow
+    covered, covered_flow : whether the interval holds the truth at the assumed flow, and at one
         drawn from the assumption's own spread
     width : of the interval with both causes
     withheld : why the product would give no value there
@@ -105,25 +105,23 @@ def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
         name=case.name, status=status,
         true_drop_mmhg=np.nan if true is None else (1 - true[0]) * usual.aortic_pressure_mmhg,
     )  # fmt: skip
-    still = dataclasses.replace(usual, flow_sigma=0.0, split_sigma=0.0)
-    found, exact = _at(tree, told(tree, usual), place), _at(tree, told(tree, still), place)
-    if true is None or found is None or exact is None:
+    found = _at(tree, told(tree, usual), place)
+    if true is None or found is None:
         return row
     rng = np.random.default_rng(seed)
     drawn = dataclasses.replace(
         usual,
         velocity_m_s=usual.velocity_m_s
         * float(np.exp(np.log1p(usual.relative_flow_sigma) * rng.standard_normal())),
-        split_exponent=usual.split_exponent + usual.split_sigma * float(rng.standard_normal()),
     )
     other = _at(truth, told(truth, drawn), place)
     return dataclasses.replace(
         row,
         drop_mmhg=(1 - found[0]) * usual.aortic_pressure_mmhg,
-        covered=exact[1] <= true[0] <= exact[2],
+        covered=found[1] <= true[0] <= found[2],
         covered_flow=other is not None and found[1] <= other[0] <= found[2],
         width=found[2] - found[1],
-        withheld=found[3],
+        withheld=found[3] or ("degraded" if status == "degraded" else ""),
     )
 
 
@@ -149,8 +147,8 @@ def diameters(case: StenosisCase, tree: Tree) -> DiameterError:
     )
 
 
-def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float]:
-    """Floor, share and narrowing of ``flow.spread`` that make the errors likeliest (Gaussian)."""
+def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float, float]:
+    """Constants of ``flow.spread`` that make the errors likeliest: floor, share, narrow, lost."""
     true, found, healthy = (
         np.concatenate([getattr(e, name) for e in errors])
         for name in ("true_mm", "found_mm", "healthy_mm")
@@ -158,13 +156,15 @@ def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float]:
     narrow = np.maximum(np.nan_to_num(healthy - found), 0.0)
 
     def cost(log: np.ndarray) -> float:
-        floor, share, narrowing = np.exp(log)
+        floor, share, narrowing, lost = np.exp(log)
         variance = floor**2 + (share * found) ** 2 + (narrowing * narrow) ** 2
-        return float(np.mean(0.5 * np.log(variance) + 0.5 * (found - true) ** 2 / variance))
+        return float(
+            np.mean(0.5 * np.log(variance) + 0.5 * (found - lost * narrow - true) ** 2 / variance)
+        )
 
-    best = minimize(cost, np.log([0.1, 0.05, 0.1]), method="Nelder-Mead")
-    floor, share, narrowing = np.exp(best.x)
-    return float(floor), float(share), float(narrowing)
+    best = minimize(cost, np.log([0.1, 0.05, 0.1, 0.05]), method="Nelder-Mead")
+    floor, share, narrowing, lost = np.exp(best.x).tolist()
+    return floor, share, narrowing, lost
 
 
 def solver_gap(tree: Tree, drop: PressureDrop) -> float:
@@ -194,6 +194,7 @@ def table(rows: Sequence[FlowRow]) -> str:
         return f"{len(rows)} cases, no lesion found"
     share = np.array([(r.drop_mmhg or 0.0) / r.true_drop_mmhg - 1 for r in seen])
     n = len(seen)
+    given = [r for r in seen if not r.withheld]
     within = int((np.abs(share) <= 0.1).sum())
     held = sum(bool(r.withheld) for r in seen)
     return "\n".join([
@@ -205,7 +206,8 @@ def table(rows: Sequence[FlowRow]) -> str:
         f"| interval covers, flow as assumed | {sum(r.covered for r in seen)} of {n} |",
         f"| interval covers, flow drawn | {sum(r.covered_flow for r in seen)} of {n} |",
         f"| width of the interval, median | {np.median([r.width or 0.0 for r in seen]):.2f} |",
-        f"| value withheld | {held} of {n} |", "",
+        f"| value withheld | {held} of {n} |",
+        f"| interval covers, of values given | {sum(r.covered for r in given)} of {len(given)} |", "",
         f"{len(rows)} cases, {sum(r.status == 'refused' for r in rows)} refused, "
         f"{len(rows) - n} without the lesion",
     ])  # fmt: skip

@@ -55,9 +55,7 @@ _ASSUMED = {
 )  # fmt: skip
 @click.option("--force", is_flag=True, help="Replace a folder that gcar wrote.")
 @talk_options("as_json")
-def flow(
-    result: Path, assumed: Assumption, out: Path | None, force: bool, talk: Talk
-) -> None:
+def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk: Talk) -> None:
     """Tell Pd/Pa along each vessel at an assumed hyperaemic flow, as an interval.
 
     Closed forms on the tree of a result folder: Poiseuille's law with taper, and the loss behind

@@ -20,7 +20,10 @@ VERBS = {
     "validate": ("gcar_deploy.cli.validate", "Check pictures and geometry; reconstruct nothing."),
     "geometry": ("gcar_deploy.cli.geometry", "Read or show where the views were taken from."),
     "enhance": ("gcar_deploy.cli.enhance", "Show the steps of finding vessels in one picture."),
-    "flow": ("gcar_deploy.cli.flow", "Tell the pressure drop at an assumed flow; files for solvers."),
+    "flow": (
+        "gcar_deploy.cli.flow",
+        "Tell the pressure drop at an assumed flow; files for solvers.",
+    ),
     "demo": ("gcar_deploy.cli.demo", "Reconstruct the case that comes along."),
     "batch": ("gcar_deploy.cli.batch", "Reconstruct every case of a table."),
     "serve": ("gcar_deploy.cli.serve", "Keep a warm engine for host programs."),

@@ -85,6 +85,7 @@ class Assumption:
         )
         return (
             f"Assumed: {flow} (SD {self.relative_flow_sigma:.0%}), split by diameter^"
-            f"{self.split_exponent:g} (SD of a share {self.split_sigma:.0%}), Pa {self.aortic_pressure_mmhg:g} "
-            f"mmHg, rigid round vessels, steady flow. Not measured; not a fractional flow reserve."
+            f"{self.split_exponent:g} (SD of a share {self.split_sigma:.0%}), Pa "
+            f"{self.aortic_pressure_mmhg:g} mmHg, rigid round vessels, steady flow. Not measured; "
+            "not a fractional flow reserve."
         )

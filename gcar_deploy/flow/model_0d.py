@@ -7,6 +7,7 @@ the inlet; each outlet is a resistance to 0 mmHg that passes the assumed flow at
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,7 @@ def _pieces(branch: Branch, number: int, drop: PressureDrop) -> list[dict[str, A
     length = np.linalg.norm(np.diff(branch.points_mm, axis=0), axis=1)
     R = piece_resistance(branch.radius_mm, length, drop.assumed.viscosity_pa_s)
     out = []
-    for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+    for k, (a, b) in enumerate(itertools.pairwise(cuts)):
         S = sum(
             float(expansion_loss(branch.radius_mm[e.throat], branch.radius_mm[e.behind],
                                  drop.assumed.density_kg_m3))

@@ -105,7 +105,9 @@ def network_of(
             left_out.setdefault(k, "the tree has a loop upstream")
     return Network(
         parent=tuple(parent), children=children, order=tuple(order), left_out=left_out,
-        calibre_mm=np.array([calibre_mm(*pair) for pair in zip(tree.branches, lumens, strict=True)]),
+        calibre_mm=np.array([
+            calibre_mm(branch, lumen) for branch, lumen in zip(tree.branches, lumens, strict=True)
+        ]),
         draw=np.array([
             1.0 if below else min(branch.length_mm / FULL_MM, 1.0)
             for branch, below in zip(tree.branches, children, strict=True)
@@ -128,9 +130,7 @@ def calibre_mm(branch: Branch, lumen: BranchLumen) -> float:
     return float(max(np.median(lumen.healthy_mm[near]), wide))
 
 
-def flows(
-    network: Network, calibre_mm: Array, draw: Array, assumed: Assumption
-) -> Array:
+def flows(network: Network, calibre_mm: Array, draw: Array, assumed: Assumption) -> Array:
     """Flow through each branch; what enters a bifurcation leaves it.
 
     Parameters

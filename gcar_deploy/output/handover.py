@@ -62,7 +62,7 @@ def handover_files(tree: Tree, drop: PressureDrop) -> tuple[dict[str, bytes], li
     surface = artery_surface(tree, drop)
     if surface.left_round:
         notes.append(
-            f"{', '.join(surface.left_round)} stays round and has no cap: another vessel is too near"
+            f"{', '.join(surface.left_round)} stays round, without a cap: another vessel is too near"
         )
     skipped = len(tree.branches) - len(drop.network.order)
     if skipped:
@@ -133,7 +133,9 @@ def surface_stl(surface: OpenSurface) -> bytes:
     for k, name in enumerate(surface.names):
         own = surface.face == k
         rows = np.concatenate([normals[own], corners[own].reshape(-1, 9)], axis=1).tolist()
-        out.append("\n".join([f"solid {name}", *(facet % tuple(r) for r in rows), f"endsolid {name}"]))
+        out.append(
+            "\n".join([f"solid {name}", *(facet % tuple(r) for r in rows), f"endsolid {name}"])
+        )
     return ("\n".join(out) + "\n").encode("ascii")
 
 

@@ -48,9 +48,7 @@ def pressure_svg(drop: PressureDrop) -> str:
         )
     for value in np.arange(0, reach + 1e-9, x_step):
         at = float(x(value))
-        parts.append(
-            f'<text x="{at:.1f}" y="{_BOTTOM + 17}" text-anchor="middle">{value:g}</text>'
-        )
+        parts.append(f'<text x="{at:.1f}" y="{_BOTTOM + 17}" text-anchor="middle">{value:g}</text>')
     parts.append(
         f'<text x="{_RIGHT}" y="{_HEIGHT - 8}" text-anchor="end">mm from the ostium</text>'
         f'<text x="4" y="12">Pd/Pa (dimensionless), {drop.assumed.coverage:.0%} interval</text>'

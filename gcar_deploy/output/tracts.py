@@ -22,8 +22,8 @@ _MOST_SHARE = 0.4
 def tracts_vtp(tree: Tree, drop: PressureDrop) -> bytes:
     """Write the centrelines of the artery.
 
-    Cell arrays ``CenterlineIds``, ``TractIds``, ``GroupIds``, ``Blanking`` count from 0, as in VMTK;
-    ``BranchId`` is the number of a branch in every other file, 0 in a bifurcation. Point arrays
+    Cell arrays ``CenterlineIds``, ``TractIds``, ``GroupIds`` count from 0, as in VMTK, ``Blanking``
+    is 1 in bifurcations; ``BranchId`` is the number of a branch in every other file, 0 in a bifurcation. Point arrays
     ``MaximumInscribedSphereRadius`` and ``Radius``, mm.
     """
     network = drop.network

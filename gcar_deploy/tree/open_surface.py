@@ -154,9 +154,7 @@ def _cut(
     return _clipped(vertices, faces, level)
 
 
-def _beyond(
-    vertices: Points, faces: Array, s: Array, middle: Points, reach: float
-) -> Array | None:
+def _beyond(vertices: Points, faces: Array, s: Array, middle: Points, reach: float) -> Array | None:
     """Vertices of the piece beyond the plane that the end is on; None where it is no mere end."""
     above = s > 0
     near = np.flatnonzero(above & (np.linalg.norm(vertices - middle, axis=1) <= reach))
@@ -175,9 +173,7 @@ def _beyond(
     return own
 
 
-def _clipped(
-    vertices: Points, faces: Array, level: Array
-) -> tuple[Points, Array, Array] | None:
+def _clipped(vertices: Points, faces: Array, level: Array) -> tuple[Points, Array, Array] | None:
     """Keep what is below level 0; None unless the cut is one loop."""
     high, low = level[faces] > 0, level[faces] < 0
     whole = ~high.any(axis=1) & low.any(axis=1)

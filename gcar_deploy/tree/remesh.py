@@ -1,9 +1,9 @@
 """Lumen surface of even triangles, for programs that mesh its inside.
 
-Marching cubes leaves slivers wherever a corner of the lattice lies near the surface. Vertices near
-a corner are merged there (after Raman and Wenger, Computer Graphics Forum 27:791, 2008), the rest is
-evened out along the surface and drawn back onto it. A merge that would leave an edge with other than
-two triangles, or a vertex with more than one fan, is taken back.
+Marching cubes leaves slivers wherever a corner of the lattice lies near the surface. Vertices
+near a corner are merged there (after Raman and Wenger, Computer Graphics Forum 27:791, 2008), the
+rest is evened out along the surface and drawn back onto it. A merge that would leave an edge with
+other than two triangles, or a vertex with more than one fan, is taken back.
 """
 
 from __future__ import annotations

@@ -98,15 +98,15 @@ def test_a_doubt_goes_downstream_and_not_beside():
 
 def test_what_is_not_joined_to_an_artery_or_lies_behind_a_loop_is_left_out():
     points = np.stack([np.linspace(0, 30, 31), np.zeros(31), np.zeros(31)], axis=1)
-    far = points + [0, 50, 0]
+    far = points + np.array([0, 50, 0])
     two = Tree(nodes_mm=np.stack([points[0], points[-1], far[0], far[-1]]),
                branches=(branch(points, 1.5), branch(far, 1.4, 2, 3)))  # fmt: skip
     lumens = [branch_lumen(b) for b in two.branches]
     plain = pressure_drop(two, lumens)
     assert "not joined" in plain.vessels[1].withheld and np.isnan(plain.vessels[1].ratio).all()
     assert not pressure_drop(two, lumens, names=["LAD", "RCA"]).vessels[1].withheld
-    ring = [branch(points, 1.5), branch(points + [30, 0, 0], 1.4, 1, 2),
-            branch(points[::-1] + [30, 5, 0], 1.4, 3, 2), branch(points, 1.4, 2, 4)]  # fmt: skip
+    ring = [branch(points, 1.5), branch(points + np.array([30, 0, 0]), 1.4, 1, 2),
+            branch(points[::-1] + np.array([30, 5, 0]), 1.4, 3, 2), branch(points, 1.4, 2, 4)]  # fmt: skip
     nodes = np.array([[0, 0, 0], [30, 0, 0], [60, 0, 0], [60, 5, 0], [90, 0, 0.0]])
     looped = drop_of(Tree(nodes_mm=nodes, branches=tuple(ring)))
     assert "loop" in looped.vessels[3].withheld

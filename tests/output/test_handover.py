@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 
 import numpy as np
@@ -136,7 +137,9 @@ def crossings(surface: Surface) -> int:
     near = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=1)
     pairs = pairs[near < size[pairs].sum(axis=1)]
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    shared = (surface.faces[pairs[:, 0], :, None] == surface.faces[pairs[:, 1], None, :]).any((1, 2))
+    shared = (surface.faces[pairs[:, 0], :, None] == surface.faces[pairs[:, 1], None, :]).any(
+        (1, 2)
+    )
     pairs = pairs[~shared]
     a = corners[pairs[:, 1]]
     e1, e2 = a[:, 1] - a[:, 0], a[:, 2] - a[:, 0]
@@ -229,7 +232,7 @@ def test_tracts_are_what_vmtk_expects(made, tmp_path):
         for cell in own:
             ids = data.GetCell(int(cell)).GetPointIds()
             lines.append(points[[ids.GetId(k) for k in range(ids.GetNumberOfIds())]])
-        for first, second in zip(lines[:-1], lines[1:], strict=True):
+        for first, second in itertools.pairwise(lines):
             np.testing.assert_allclose(first[-1], second[0], atol=1e-9)
         length = sum(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines)
         outlet = drop.network.outlets[centerline]
