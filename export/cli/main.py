@@ -274,6 +274,7 @@ for _verb in (
     refine_table,
     cost_curves,
     sigma_table,
+    flow_table,
     gate_table,
     wrong_scenes,
     ghost_fit,

@@ -207,7 +207,8 @@ def table(rows: Sequence[FlowRow]) -> str:
         f"| interval covers, flow drawn | {sum(r.covered_flow for r in seen)} of {n} |",
         f"| width of the interval, median | {np.median([r.width or 0.0 for r in seen]):.2f} |",
         f"| value withheld | {held} of {n} |",
-        f"| interval covers, of values given | {sum(r.covered for r in given)} of {len(given)} |", "",
+        f"| interval covers, of values given | {sum(r.covered for r in given)} of {len(given)} |",
+        "",
         f"{len(rows)} cases, {sum(r.status == 'refused' for r in rows)} refused, "
         f"{len(rows) - n} without the lesion",
     ])  # fmt: skip

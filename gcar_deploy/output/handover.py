@@ -62,7 +62,7 @@ def handover_files(tree: Tree, drop: PressureDrop) -> tuple[dict[str, bytes], li
     surface = artery_surface(tree, drop)
     if surface.left_round:
         notes.append(
-            f"{', '.join(surface.left_round)} stays round, without a cap: another vessel is too near"
+            f"{', '.join(surface.left_round)} stays round, without a cap: a vessel is too near"
         )
     skipped = len(tree.branches) - len(drop.network.order)
     if skipped:

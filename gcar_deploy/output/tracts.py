@@ -23,8 +23,8 @@ def tracts_vtp(tree: Tree, drop: PressureDrop) -> bytes:
     """Write the centrelines of the artery.
 
     Cell arrays ``CenterlineIds``, ``TractIds``, ``GroupIds`` count from 0, as in VMTK, ``Blanking``
-    is 1 in bifurcations; ``BranchId`` is the number of a branch in every other file, 0 in a bifurcation. Point arrays
-    ``MaximumInscribedSphereRadius`` and ``Radius``, mm.
+    is 1 in bifurcations; ``BranchId`` is the number of a branch in every other file, 0 in a
+    bifurcation. Point arrays ``MaximumInscribedSphereRadius`` and ``Radius``, mm.
     """
     network = drop.network
     head, tail = _lengths(tree, drop)

@@ -106,7 +106,8 @@ def test_what_is_not_joined_to_an_artery_or_lies_behind_a_loop_is_left_out():
     assert "not joined" in plain.vessels[1].withheld and np.isnan(plain.vessels[1].ratio).all()
     assert not pressure_drop(two, lumens, names=["LAD", "RCA"]).vessels[1].withheld
     ring = [branch(points, 1.5), branch(points + np.array([30, 0, 0]), 1.4, 1, 2),
-            branch(points[::-1] + np.array([30, 5, 0]), 1.4, 3, 2), branch(points, 1.4, 2, 4)]  # fmt: skip
+            branch(points[::-1] + np.array([30, 5, 0]), 1.4, 3, 2),
+            branch(points, 1.4, 2, 4)]  # fmt: skip
     nodes = np.array([[0, 0, 0], [30, 0, 0], [60, 0, 0], [60, 5, 0], [90, 0, 0.0]])
     looped = drop_of(Tree(nodes_mm=nodes, branches=tuple(ring)))
     assert "loop" in looped.vessels[3].withheld
