@@ -147,7 +147,7 @@ def _reconstructed(
         losses=refined.losses, predictor=centers.points.source, refiner=refined.refiner,
         model=None if predictor is None else predictor.model.label,
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
-        notes=(), options=options,
+        notes=(), options=options, ending=refined.ending,
     )  # fmt: skip
 
 

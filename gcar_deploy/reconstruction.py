@@ -23,7 +23,6 @@ from gcar_deploy.geometry.observability import (
     EXACT_DISAGREEMENT,
     depth_and_plane,
     silent_errors,
-    worst_sigma,
 )
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.measure import BranchName, Measured, measured
@@ -32,6 +31,7 @@ from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
 from gcar_deploy.quality import Quality, part_lengths_mm, unexplained
 from gcar_deploy.tree.tree import Branch, Tree, along
+from gcar_deploy.tubes import Ending
 from gcar_deploy.types import Mask, Scalars, Volume
 
 SCHEMA = "gcar-result/1"
@@ -68,6 +68,7 @@ class Reconstruction:
     segmenter : the same of the network that found vessels, None where none was asked
     notes : sentences for the user that do not lower the status
     options : RunOptions
+    ending : how the fit of the tubes ended, None where none were fitted
     """
 
     quality: Quality
@@ -87,6 +88,7 @@ class Reconstruction:
     segmenter: Mapping[str, str] | None
     notes: tuple[str, ...]
     options: RunOptions
+    ending: Ending | None = None
 
     @property
     def status(self) -> str:
@@ -201,6 +203,7 @@ class Reconstruction:
             "best_further_view": None if further is None else dataclasses.asdict(further),
             "counts": dict(self.counts),
             "losses": list(self.losses),
+            "fit": None if self.ending is None else dataclasses.asdict(self.ending),
             "seconds": dict(self.seconds),
             "predictor": self.predictor,
             "refiner": self.refiner,
@@ -223,6 +226,8 @@ class Reconstruction:
                 reasons[path] = body["pressure"]["branches"][k]["withheld"]
         if self.model is None:
             reasons["/model"] = "made without a model"
+        if self.ending is None:
+            reasons["/fit"] = "no tubes were fitted"
         if self.segmenter is None:
             reasons["/segmenter"] = "no network looked for vessels in the pictures"
         out["reasons"] = reasons
@@ -310,6 +315,7 @@ class Reconstruction:
             "estimated_offset_mm": list(pose.offset_mm),
             "estimated_primary_deg": pose.primary_deg,
             "estimated_secondary_deg": pose.secondary_deg,
+            "pose_converged": pose.converged,
         }
 
 
@@ -354,9 +360,8 @@ def _sigma(branch: Branch, carms: Sequence[CArm]) -> dict[str, float | None]:
     )  # fmt: skip
     if branch.covariance_mm2 is None:
         return dict.fromkeys(names)
-    fit, geometry = (worst_sigma(branch.covariance_mm2[:, part]) for part in (0, 1))
     axes = depth_and_plane(branch.covariance_mm2.sum(axis=1), branch.points_mm, carms)
-    means = (float(sigma.mean()) for sigma in (fit, geometry, *axes))
+    means = (float(sigma.mean()) for sigma in (*branch.sigma_parts_mm.T, *axes))
     return dict(zip(names, means, strict=True))
 
 

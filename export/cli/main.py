@@ -12,10 +12,8 @@ from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli.centers import centers_table, robustness
 from gcar_export.cli.evaluate import converge, evaluate
 from gcar_export.cli.gates import gate_table, ghost_fit
-from gcar_export.cli.refine import cost_curves, refine_table, sigma_table
-from gcar_export.cli.wrong_scenes import wrong_scenes
-from gcar_export.cli.gates import gate_table
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table
+from gcar_export.cli.wrong_scenes import wrong_scenes
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)

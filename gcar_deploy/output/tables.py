@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.geometry.observability import worst_sigma
 from gcar_deploy.measure import Measured
 from gcar_deploy.output.vtp import poly_data
 from gcar_deploy.tree.tree import Branch, Tree
@@ -23,7 +22,8 @@ _RED = (0.86, 0.16, 0.16)
 _OPACITY_RANGE = (0.01, 0.99)
 
 #: entries of a covariance, in the order of a symmetric tensor in VTK
-_ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "yz": (1, 2), "xz": (0, 2)}
+_ENTRIES = ("xx", "yy", "zz", "xy", "yz", "xz")
+_ROWS, _COLUMNS = [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]
 
 
 def npz_bytes(arrays: Mapping[str, Array | str | float]) -> bytes:
@@ -151,10 +151,10 @@ def _told(measured: Measured) -> list[tuple[str, float]]:
 
 def _spread(branch: Branch, part: int) -> tuple[Array, Array]:
     """(m,) sigma in the worst direction and (m, 6) covariance of the fit (0) or geometry (1)."""
-    if branch.covariance_mm2 is None:
-        return np.full(len(branch), np.nan), np.full((len(branch), 6), np.nan)
-    covariance = branch.covariance_mm2[:, part]
-    return worst_sigma(covariance), covariance[:, *zip(*_ENTRIES.values(), strict=True)]
+    six: Array = np.full((len(branch), 6), np.nan)
+    if branch.covariance_mm2 is not None:
+        six = branch.covariance_mm2[:, part][:, _ROWS, _COLUMNS]
+    return branch.sigma_parts_mm[:, part], six
 
 
 def _spreads(tree: Tree, part: int) -> tuple[Array, Array]:

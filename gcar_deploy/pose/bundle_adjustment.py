@@ -48,11 +48,14 @@ class Adjusted:
     before_mm, after_mm : float
         Robust mean distance of the tree's points from the pictures' lines, the points free to
         suit all views as well as they can, with the corrections as given and as found.
+    moving : float
+        How far the last step still moved or turned a view, mm or deg.
     """
 
     theta: Array
     before_mm: float
     after_mm: float
+    moving: float = 0.0
 
 
 def adjust(
@@ -74,9 +77,11 @@ def adjust(
     if len(points) < LEAST_POINTS or not all(line.any for line in lines):
         return Adjusted(theta, 0.0, 0.0)
     pixels = np.empty((0, len(told), 2)) if marks is None else marks
-    kept, before = _settled(points, lines, told, theta, pixels, poses=False)
-    found, after = _settled(points, lines, told, theta, pixels, poses=True)
-    return Adjusted(found, before, after) if after < before else Adjusted(kept, before, before)
+    kept, before, _ = _settled(points, lines, told, theta, pixels, poses=False)
+    found, after, moving = _settled(points, lines, told, theta, pixels, poses=True)
+    return (
+        Adjusted(found, before, after, moving) if after < before else Adjusted(kept, before, before)
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,8 +129,8 @@ def _sampled(tree: Tree, spacing_mm: float) -> Points:
 def _settled(
     points: Points, lines: Sequence[_Lines], told: Sequence[CArm], theta: Array, marks: Array,
     *, poses: bool,
-) -> tuple[Array, float]:  # fmt: skip
-    """Corrections and mean distance after the steps; ``poses`` False moves the points alone."""
+) -> tuple[Array, float, float]:  # fmt: skip
+    """Corrections, mean distance and last move after the steps; ``poses`` False: points alone."""
     theta, points = theta.copy(), points.copy()
     reach = REACH_MM
     for _ in range(STEPS):
@@ -136,7 +141,8 @@ def _settled(
             theta[1:] += turn
         reach = max(NEAR_MM, 0.8 * reach)
     gap = _linearised(points, lines, told, theta, reach)[0]
-    return theta, float(np.minimum(np.abs(gap), reach).mean())
+    distance = float(np.minimum(np.abs(gap), reach).mean())
+    return theta, distance, float(np.abs(turn).max(initial=0.0)) if poses else 0.0
 
 
 def _linearised(

@@ -24,8 +24,9 @@ ROUNDS = 2
 LEAST_PX = 0.6
 #: makes a tree of views that have their corrections built in
 TreeOf: TypeAlias = Callable[[Sequence[VesselImage]], Tree]
-#: a view that moves by less than this between rounds has arrived, mm
-ARRIVED_MM = 0.5
+#: a view that moves by less than this between rounds has arrived, mm; and within a round, by less
+#: than this a step, mm or deg
+ARRIVED_MM, ARRIVED_STEP = 0.5, 0.05
 
 
 def bundled(
@@ -62,9 +63,13 @@ def bundled(
         found = adjust(tree, views, told, theta, marks)
         near_mm = LEAST_PX * max(carm.pixel_at_isocenter_mm for carm in told)
         if found.before_mm < near_mm or found.after_mm >= MIN_GAIN * found.before_mm:
+            if poses is not first:  # the last round stands
+                poses = tuple(dataclasses.replace(pose, converged=True) for pose in poses)
             break
-        poses = tuple(_at(pose, t) for pose, t in zip(poses, found.theta, strict=True))
-        if np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM:
+        arrived = bool(np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM)
+        still = arrived and found.moving < ARRIVED_STEP
+        poses = tuple(_at(pose, t, still) for pose, t in zip(poses, found.theta, strict=True))
+        if arrived:
             break
     return first if poses == first else poses_between(views, options, poses)
 
@@ -75,8 +80,12 @@ def posed(view: VesselImage, pose: Pose) -> VesselImage:
     return view if carm is view.carm else dataclasses.replace(view, carm=carm)
 
 
-def _at(pose: Pose, theta: np.ndarray) -> Pose:
+def _at(pose: Pose, theta: np.ndarray, converged: bool) -> Pose:
     x, y, z, primary, secondary = (float(value) for value in theta)
     return dataclasses.replace(
-        pose, offset_mm=(x, y, z), primary_deg=primary, secondary_deg=secondary
+        pose,
+        offset_mm=(x, y, z),
+        primary_deg=primary,
+        secondary_deg=secondary,
+        converged=converged,
     )

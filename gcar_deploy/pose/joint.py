@@ -56,7 +56,7 @@ def corrected(carm: CArm, theta: Array) -> CArm:
 
 def estimate_jointly(
     masses: Sequence[Mass | None], first: Array, options: PoseOptions, marks: Array
-) -> Array:
+) -> tuple[Array, bool]:
     """Estimate the corrections of all views but the first from all pairs.
 
     Parameters
@@ -68,20 +68,21 @@ def estimate_jointly(
 
     Returns
     -------
-    (V, 5) corrections; ``first`` where fewer than three pairs can be compared, where there are
-    more views than ``joint_most_views`` (the cost grows with their cube), where all pairs agree as
-    they are told, or where all pairs together do not agree better after the joint fit
+    theta : (V, 5) corrections; ``first`` where fewer than three pairs can be compared, where
+        there are more views than ``joint_most_views`` (the cost grows with their cube), where all
+        pairs agree as they are told, or where they do not agree better after the joint fit
+    converged : bool, False where the joint fit stopped at its cap
     """
     seen = {k: mass for k, mass in enumerate(masses) if mass is not None}
     problem = _Problem(seen, options, marks)
     if len(problem.pairs) < 3 or len(seen) > MOST_VIEWS:
-        return first
+        return first, True
     if not first.any() and max(problem.disagreements(first)) <= AGREED:
-        return first
-    theta = problem.fitted(problem.shifts(first))
+        return first, True
+    theta, converged = problem.fitted(problem.shifts(first))
     if problem.mean_disagreement(theta) >= problem.mean_disagreement(first):
-        return first
-    return problem.without_the_needless(theta)
+        return first, True
+    return problem.without_the_needless(theta), converged
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -195,15 +196,15 @@ class _Problem:
         out[1:, :3] = min(found, key=lambda f: float(f.fun)).x.reshape(-1, 3)
         return out
 
-    def fitted(self, theta: Array) -> Array:
-        """(V, 5) offsets and angles together, from coarse to fine profiles."""
+    def fitted(self, theta: Array) -> tuple[Array, bool]:
+        """(V, 5) offsets and angles together, from coarse to fine profiles; did they converge."""
         prior = np.tile(self.prior, len(theta) - 1)
         calibrated = all(mass.calibrated for mass in self.seen.values())
-        x = fit_profiles(
+        x, converged = fit_profiles(
             self.residuals, self.left, theta[1:].ravel(), prior, self.options,
             calibrated=calibrated, noise=self.noise,
         )  # fmt: skip
-        return _with_first(x)
+        return _with_first(x), converged
 
     def without_the_needless(self, theta: Array) -> Array:
         """Leave a view alone whose correction does not clearly help it to agree."""

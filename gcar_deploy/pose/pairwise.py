@@ -59,6 +59,8 @@ class Pose:
         View that this one was compared with; itself where there was none to compare with.
     landmark_before_mm, landmark_after_mm : float or None
         Root mean square distance between the rays of the landmarks that both views show.
+    converged : bool
+        False where the correction is that of a fit that was stopped at its cap.
     """
 
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -69,6 +71,7 @@ class Pose:
     partner: int = 0
     landmark_before_mm: float | None = None
     landmark_after_mm: float | None = None
+    converged: bool = True
 
     @property
     def shift_mm(self) -> float:
@@ -143,11 +146,14 @@ def estimate_poses(
     found = tuple(poses[k] for k in range(len(views)))
     if len(views) < 3 or not options.enabled:
         return found
-    theta = estimate_jointly(masses, np.stack([p.theta for p in found]), options, marks)
+    theta, converged = estimate_jointly(masses, np.stack([p.theta for p in found]), options, marks)
     if all(np.array_equal(t, p.theta) for t, p in zip(theta, found, strict=True)):
         return found
     return tuple(
-        _joint(k, theta, found[k].partner, masses, options, marks) for k in range(len(views))
+        dataclasses.replace(
+            _joint(k, theta, found[k].partner, masses, options, marks), converged=converged
+        )
+        for k in range(len(views))
     )
 
 
@@ -166,7 +172,10 @@ def judged_poses(
     masses = [vessel_mass(*view, known) for view, known in zip(views, calibrated, strict=True)]
     theta = np.stack([pose.theta for pose in poses])
     return tuple(
-        _joint(k, theta, pose.partner, masses, options, marks) for k, pose in enumerate(poses)
+        dataclasses.replace(
+            _joint(k, theta, pose.partner, masses, options, marks), converged=pose.converged
+        )
+        for k, pose in enumerate(poses)
     )
 
 
@@ -228,7 +237,9 @@ def _estimate(
         r = residuals(theta, options.coarse_mm, noise)
         if float(r @ r) < best:
             start, best = theta, float(r @ r)
-    start = fit_profiles(residuals, left, start, prior, options, calibrated=calibrated, noise=noise)
+    start, converged = fit_profiles(
+        residuals, left, start, prior, options, calibrated=calibrated, noise=noise
+    )
     carm = corrected(moving.carm, start)
     after, gap_after = (
         disagreement(fixed, moving, carm, options.fine_mm),
@@ -248,6 +259,7 @@ def _estimate(
         after=after,
         landmark_before_mm=gap,
         landmark_after_mm=gap_after,
+        converged=converged,
     )
 
 

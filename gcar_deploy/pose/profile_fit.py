@@ -32,7 +32,8 @@ MASK_NOISE = 0.1
 MOST_APART_DEG = 150.0
 #: a correction must lower the disagreement to this share of what it was
 MIN_GAIN, MASK_MIN_GAIN = 0.85, 0.8
-MAX_EVALUATIONS = 40
+#: looks at the profiles after which a fit stops where it is: more than pairs of one tree need
+MAX_EVALUATIONS = 120
 #: relative change of the objective or of the pose below which a fit ends
 TOLERANCE = 1e-4
 #: finite differences reach so far, as a share of a parameter's prior
@@ -51,8 +52,8 @@ Residuals = Callable[[Array, float, float], Scalars]
 def fit_profiles(
     residuals: Residuals, left: Callable[[Array, float], float], start: Array, prior: Array,
     options: PoseOptions, *, calibrated: bool, noise: float = PROFILE_NOISE,
-) -> Array:  # fmt: skip
-    """Return the pose parameters under which the profiles agree best, given their priors.
+) -> tuple[Array, bool]:  # fmt: skip
+    """Find the pose parameters under which the profiles agree best, given their priors.
 
     Parameters
     ----------
@@ -62,6 +63,11 @@ def fit_profiles(
     options : PoseOptions
     calibrated : bool, all pictures hold path lengths in mm
     noise : of the profiles where they do not, as a share of their norm
+
+    Returns
+    -------
+    x : (n,)
+    converged : bool, False where the fit that gave ``x`` was stopped by ``MAX_EVALUATIONS``
     """
     steps = STEP_SHARE * np.diag(prior)
 
@@ -71,30 +77,29 @@ def fit_profiles(
         ahead = [residuals(x + step, sigma, noise) - here for step in steps]
         return np.stack(ahead, axis=1) / np.diag(steps)
 
-    def fitted(x: Array, sigma: float, noise: float) -> Array:
+    def fitted(x: Array, sigma: float, noise: float) -> tuple[Array, bool]:
         solution = least_squares(
             residuals, x, jac=slopes, args=(sigma, noise), x_scale=prior,
             ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
-        out: Array = np.round(solution.x, DIGITS)
-        return out
+        return np.round(solution.x, DIGITS), bool(solution.status > 0)
 
     if not calibrated:
-        x = fitted(start, options.coarse_mm, noise)
+        x, _ = fitted(start, options.coarse_mm, noise)
         return fitted(x, options.fine_mm, noise)
     x, now = start, left(start, options.fine_mm)
     if now > PROFILE_NOISE:
-        x = fitted(x, options.coarse_mm, PROFILE_NOISE)
+        x, _ = fitted(x, options.coarse_mm, PROFILE_NOISE)
         now = left(x, options.fine_mm)
     for _ in range(MOST_FITS):
         error = max(TRIAL_SHARE * min(now, PROFILE_NOISE), CALIBRATED_NOISE)
-        trial = fitted(x, options.fine_mm, error)
+        trial, converged = fitted(x, options.fine_mm, error)
         then = left(trial, options.fine_mm)
         if then > MIN_GAIN * now:
             break  # what is left is not the pose's
         x, now = trial, then
         if error == CALIBRATED_NOISE:
-            return x
+            return x, converged
     return fitted(x, options.fine_mm, max(now, CALIBRATED_NOISE))
 
 

@@ -77,6 +77,7 @@ def register(
     findings += order
     moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
     findings += check_poses(views, moves, options.quality)
+    findings += _unfinished(views, poses)
     after, partners = [pose.after for pose in poses], [pose.partner for pose in poses]
     refusal = ""
     try:
@@ -91,3 +92,13 @@ def register(
         hint=hint,
         refusal=refusal,
     )
+
+
+def _unfinished(views: Sequence[VesselImage], poses: Sequence[Pose]) -> list[str]:
+    """Name views whose correction was cut short; one that stays where it was told has none."""
+    return [
+        f"view {view.view_id}: the estimate of where it stands was stopped at its cap of steps, "
+        "not at its best: the tree may be displaced or bent"
+        for view, pose in zip(views, poses, strict=True)
+        if not pose.converged and pose.theta.any()
+    ]

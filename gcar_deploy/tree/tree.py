@@ -48,6 +48,14 @@ class Branch:
         return float(self.arc_mm[-1])
 
     @property
+    def sigma_parts_mm(self) -> Array:
+        """(m, 2) sigma in the worst direction of what the fit leaves open, and of the geometry."""
+        if self.covariance_mm2 is None:
+            return np.full((len(self), 2), np.nan)
+        largest: Array = np.linalg.eigvalsh(self.covariance_mm2)[..., -1]
+        return np.sqrt(np.maximum(largest, 0.0))
+
+    @property
     def tangents(self) -> Points:
         """(m, 3) unit vectors along the centreline."""
         return polyline_tangents(self.points_mm)

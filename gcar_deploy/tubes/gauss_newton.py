@@ -35,6 +35,29 @@ MAX_MOVE_MM = 1.5
 MAX_LOG_STEP = 0.4
 #: rejected steps in a row after which a level gives up.
 MAX_REJECTED = 5
+#: share of its length that a step keeps in the next one; single ratios jump with the damping
+SHRINK = 5 / 6
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ending:
+    """How the last level of a fit ended.
+
+    Attributes
+    ----------
+    converged : bool
+        A step lowered the objective by less than ``TOLERANCE``, or none lowered it; False where
+        the fit was stopped first, at its cap of steps or by a deadline.
+    steps : int
+        Of that level.
+    left_mm : float
+        How far going on would still move the tree's points on average: the last step's mean length
+        as a geometric series of ratio ``SHRINK``.
+    """
+
+    converged: bool
+    steps: int
+    left_mm: float
 
 
 @dataclasses.dataclass(eq=False)
@@ -50,6 +73,8 @@ class Progress:
         The caller asked to stop (deadline or cancel).
     failed : bool
         The objective was not finite.
+    ending : Ending or None
+        Of the last level.
     """
 
     losses: list[float] = dataclasses.field(default_factory=list)
@@ -57,6 +82,7 @@ class Progress:
     rejected: int = 0
     stopped: bool = False
     failed: bool = False
+    ending: Ending | None = None
 
 
 def fit_level(
@@ -77,6 +103,7 @@ def fit_level(
     if not np.isfinite(loss):
         progress.failed = True
         return tubes, prints
+    move, taken, converged = 0.0, 0, False
     for _ in range(steps):
         if should_stop is not None and should_stop():
             progress.stopped = True
@@ -91,15 +118,21 @@ def fit_level(
             damping = max(damping * 10, 1e-2)
             progress.rejected += 1
         else:
+            converged = True
             break
         damping = max(damping * 0.3, 1e-4)
         gain = (loss - value) / max(abs(loss), 1e-12)
+        move = float(np.linalg.norm(trial.positions_mm - tubes.positions_mm, axis=1).mean())
+        taken += 1
         tubes, prints, loss = trial, trial_prints, value
         targets = rescaled(targets, prints)
         progress.steps += 1
         progress.losses.append(loss)
         if gain < TOLERANCE:
+            converged = True
             break
+    left = move * SHRINK / (1.0 - SHRINK)
+    progress.ending = Ending(converged=converged, steps=taken, left_mm=left)
     return tubes, prints
 
 

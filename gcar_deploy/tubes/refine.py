@@ -22,9 +22,13 @@ from gcar_deploy.tree.edit import without_branch_at
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
+from gcar_deploy.tubes.gauss_newton import Ending
 from gcar_deploy.tubes.gaussians import gaussians_on_tree
 from gcar_deploy.tubes.volume import tube_volume
 from gcar_deploy.types import Array, Volume
+
+#: what a fit at its cap leaves to move counts from this share of the mean sigma on
+MOST_LEFT = 0.5
 
 OnProgress = Callable[[float], None]
 #: a place on a branch that is to go may be so far off its centreline, mm
@@ -53,6 +57,7 @@ class Refined:
     contrast : (views,) factor of each picture's path on the model's, 1 where calibrated
     centers : CenterPoints the refinement started from
     model_mm : per view (rows, cols) path of the fitted tubes, mm; empty where not at hand
+    ending : how the fit ended, None where no tubes were fitted
     """
 
     refiner: str
@@ -65,11 +70,23 @@ class Refined:
     contrast: tuple[float, ...]
     centers: CenterPoints
     model_mm: tuple[Array, ...] = ()
+    ending: Ending | None = None
 
     @property
     def findings(self) -> tuple[str, ...]:
         """Reasons for ``degraded``."""
-        return (_FINDINGS[self.status],) if self.status in _FINDINGS else ()
+        if self.status in _FINDINGS:
+            return (_FINDINGS[self.status],)
+        ending = self.ending
+        if ending is None or ending.converged or not self.tree.branches:
+            return ()
+        sigma = np.concatenate([branch.sigma_mm for branch in self.tree.branches])
+        if ending.left_mm <= MOST_LEFT * float(np.mean(sigma)):
+            return ()
+        return (
+            f"the fit was stopped at its cap of {ending.steps} steps while the tree still moved: "
+            f"some {ending.left_mm:.1f} mm are left",
+        )
 
     def without(self, places_mm: Sequence[tuple[float, float, float]]) -> tuple[Refined, list[str]]:
         """Drop the branches that a person named by a place on each, one after the other.
@@ -155,6 +172,7 @@ def refine(
         contrast=fit.contrast,
         centers=centers,
         model_mm=fit.model_mm,
+        ending=fit.progress.ending,
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from gcar_deploy.config import PoseOptions, RunOptions
 from gcar_deploy.errors import RefusedError
-from gcar_deploy.pose import register
+from gcar_deploy.pose import profile_fit, register
 from tests.pose.test_agreement import pair
 
 OPTIONS = RunOptions()
@@ -51,3 +51,17 @@ def test_a_refusal_says_that_the_pictures_may_be_swapped():
     assert "contradict" in placed.refusal and "swapped?" in placed.refusal
     with pytest.raises(RefusedError, match=r"no tree.*swapped"), placed.hinting():
         raise RefusedError("no tree")
+
+
+def test_a_pose_that_was_cut_short_is_told_and_degrades(monkeypatch):
+    """With two looks at the profiles none is at its best; with the usual number all are."""
+    angiograms, views = pair(calibrated=True)
+    told = dataclasses.replace(views[1], carm=views[1].carm.moved((0.0, 0.0, 9.0)))
+    asked = (angiograms, [views[0], told], OPTIONS, never)
+    usual = register(*asked)
+    assert all(pose.converged for pose in usual.poses)
+    assert not any("cap of steps" in finding for finding in usual.findings)
+    monkeypatch.setattr(profile_fit, "MAX_EVALUATIONS", 2)
+    short = register(*asked)
+    assert not short.poses[1].converged and short.poses[1].theta.any()
+    assert any("cap of steps" in finding for finding in short.findings)

@@ -11,6 +11,7 @@ from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import (
+    Ending,
     Progress,
     fit_level,
     footprints,
@@ -199,6 +200,35 @@ def test_stop_is_asked_before_each_step():
     assert refined.status == "stopped"
     assert refined.steps <= 2
     assert refined.tree.branches
+
+
+def test_a_fit_at_its_cap_is_told_from_one_that_converged():
+    """A tree begun 1.5 mm beside its place, few steps and many, and what is left."""
+    truth = fork()
+    targets = make_targets(seen(truth, two_views()), 1.0, OPTIONS)
+    start = dataclasses.replace(
+        tubes_of(truth), positions_mm=tubes_of(truth).positions_mm + np.array([1.0, -1.0, 0.5])
+    )
+    loose = dataclasses.replace(OPTIONS, anchor_mm=100.0)
+    prior = make_prior(start, np.ones(len(start.log_radius)), loose)
+    few, many = Progress(), Progress()
+    short, _ = fit_level(start, targets, prior, loose, 2, few)
+    end, _ = fit_level(start, targets, prior, loose, 60, many)
+    assert not few.ending.converged and few.ending.steps == 2
+    assert many.ending.converged and many.ending.steps < 60
+    missing = np.linalg.norm(end.positions_mm - short.positions_mm, axis=1).mean()
+    assert 0.3 < few.ending.left_mm / missing < 8.0
+    assert many.ending.left_mm < 0.3 * few.ending.left_mm
+
+
+def test_a_fit_that_still_moves_by_half_its_sigma_is_degraded():
+    truth = fork()
+    refined = refine(points_of(truth, grid(64)), seen(truth, two_views(128, 1.0)))
+    assert refined.ending is not None and refined.findings == ()
+    sigma = float(np.concatenate([b.sigma_mm for b in refined.tree.branches]).mean())
+    for share, converged, many in ((0.4, False, 0), (0.6, False, 1), (0.6, True, 0)):
+        ending = Ending(converged=converged, steps=5, left_mm=share * sigma)
+        assert len(dataclasses.replace(refined, ending=ending).findings) == many
 
 
 def test_same_input_same_bytes():
