@@ -233,6 +233,6 @@ def _at(
         # Of several the widest: twigs run beside the vessel for a while.
         if gap[k] <= NEAR_MM and np.isfinite(vessel.ratio[k]) and (not best or width > best[0]):
             held = "" if vessel.told[k] else (vessel.withheld or "too wide")
-            ends = (float(x[k]) for x in (vessel.ratio, vessel.low, vessel.high))
-            best = width, (*ends, held)
+            ratio, low, high = (float(x[k]) for x in (vessel.ratio, vessel.low, vessel.high))
+            best = width, (ratio, low, high, held)
     return None if best is None else best[1]

@@ -185,7 +185,7 @@ def rays_miss_px(case: Exam, told: Told) -> float:
         across = np.eye(3) - ray[:, :, None] * ray[:, None]
         normal += across
         right += across @ carm.source_mm
-    found = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    found = np.linalg.solve(normal, right[:, :, None])[:, :, 0].astype(np.float64)
     gaps = [c.project(found)[0] - at for c, at in zip(told.carms, pixels, strict=True)]
     return float(np.sqrt(np.mean(np.sum(np.square(gaps), axis=2))))
 
@@ -291,9 +291,9 @@ def _noisy(image: Array, rng: np.random.Generator) -> Array:
 
 def _re_encoded(image: Array, rng: np.random.Generator) -> Array:
     """Through 8 bits and JPEG, as from a presentation."""
-    grey = np.uint8(255 * (image / image.max()))
+    grey = (255 * (image / image.max())).astype(np.uint8)
     blob = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
-    again = cv2.imdecode(blob, cv2.IMREAD_UNCHANGED).astype(np.float64)
+    again = np.asarray(cv2.imdecode(blob, cv2.IMREAD_UNCHANGED), dtype=np.float64)
     return np.rint(again / 255 * float(image.max())).astype(image.dtype)
 
 

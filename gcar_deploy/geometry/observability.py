@@ -128,12 +128,6 @@ def classes(sigma_mm: Scalars, noise_mm: float) -> Array:
     return np.where(ratio < WEAK, 0, np.where(ratio <= NONE, 1, 2)).astype(np.int64)
 
 
-def worst_sigma(covariance: Array) -> Scalars:
-    """(n,) standard deviation in the direction where it is largest, mm, of (n, 3, 3) mm^2."""
-    largest: Scalars = np.linalg.eigvalsh(covariance)[:, -1]
-    return np.sqrt(np.maximum(largest, 0.0))
-
-
 def depth_and_plane(
     covariance: Array, points_mm: Points, carms: Sequence[CArm]
 ) -> tuple[Scalars, Scalars]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.geometry.observability import worst_sigma
+from gcar_deploy.geometry.covariance import worst_sigma
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree

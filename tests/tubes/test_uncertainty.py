@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TubeOptions
-from gcar_deploy.geometry.observability import worst_sigma
+from gcar_deploy.geometry.covariance import worst_sigma
 from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
