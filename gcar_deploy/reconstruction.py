@@ -177,7 +177,7 @@ class Reconstruction:
     def _summary(self) -> dict[str, Any]:
         reasons: dict[str, str] = {}
         further = self.measured.further
-        body = {
+        body: dict[str, Any] = {
             "schema": SCHEMA,
             "status": self.quality.status,
             "sentence": self.quality.sentence,
