@@ -77,5 +77,13 @@ class QualityOptions:
     #: a larger estimated correction between the runs is no small matter of breath or table
     good_shift_mm: Length = 5.0
     good_turn_deg: Length = 1.5
+    #: A view asks for another angle or scale (``pose/significance.py``) where that lowers the
+    #: disagreement to this share of what the best shift leaves, by so much at least, and the
+    #: squared difference so many times. Chosen on generated raw and mask pairs
+    asked_ratio: Share = 0.9
+    asked_least: Share = 0.005
+    asked_gain: Annotated[float, Range(1, 1e6)] = 1.3
+    #: and the scale is off by more than this share; for the angle ``good_turn_deg`` holds
+    good_scale: Share = 0.02
     #: less tree than this is not a coronary tree
     min_length_mm: Length = 20.0

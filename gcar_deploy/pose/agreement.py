@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 from collections.abc import Sequence
 
 import numpy as np
 
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import PoseOptions, RunOptions
+from gcar_deploy.geometry.consistency import Mass, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
@@ -84,15 +86,7 @@ def poses_between(
 
     With ``known`` corrections nothing is estimated, only what the profiles say of them.
     """
-    # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
-    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
-    calibrated = [view.calibrated for view in views]
-    finest = max(pixel, options.predict.min_cell_mm) if all(calibrated) else 0.75 * pixel
-    pose = dataclasses.replace(
-        options.pose,
-        fine_mm=max(options.pose.fine_mm, finest),
-        coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
-    )
+    calibrated, pose = [view.calibrated for view in views], _smoothing(views, options)
     small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
     marks = landmark_pixels(options.landmarks, [view.carm for view in views])
     for k, (view, (carm, _)) in enumerate(zip(views, small, strict=True)):
@@ -105,36 +99,79 @@ def poses_between(
     return estimate_poses(small, pose, marks, calibrated, masks)
 
 
+def profiled(
+    views: Sequence[VesselImage], options: RunOptions
+) -> tuple[list[Mass | None], PoseOptions]:
+    """Vessel mass of every view as poses are estimated from it, and how it is to be smoothed."""
+    small = [sampled_path(v, options.predict.min_cell_mm) for v in views]
+    masses = [
+        vessel_mass(carm, path, v.calibrated, v.kind == "mask")
+        for (carm, path), v in zip(small, views, strict=True)
+    ]
+    return masses, _smoothing(views, options)
+
+
+def _smoothing(views: Sequence[VesselImage], options: RunOptions) -> PoseOptions:
+    # Profiles finer than a pixel are sampling noise, which calibrated ones would be judged by.
+    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    exact = all(view.calibrated for view in views)
+    finest = max(pixel, options.predict.min_cell_mm) if exact else 0.75 * pixel
+    return dataclasses.replace(
+        options.pose,
+        fine_mm=max(options.pose.fine_mm, finest),
+        coarse_mm=max(options.pose.coarse_mm, 1.5 * pixel),
+    )
+
+
 def other_order(views: Sequence[VesselImage], options: RunOptions) -> float | None:
-    """Compare two views whose pictures change places, without any correction.
+    """Compare views of which two pictures change places, without any correction.
 
     Returns
     -------
-    disagreement of the pictures with each other's geometry as it is told, 0 .. 1; None of three
-    and more views, and where the pictures' sizes differ: these cannot have been swapped
+    least disagreement of any two pictures with each other's geometry as it is told (of the worst
+    pair, where there are more views), 0 .. 1; None where all pictures' sizes differ: these cannot
+    have been swapped
     """
-    if len(views) != 2 or views[0].mask.shape != views[1].mask.shape:
-        return None
+    found = _other_orders(views, options)
+    return min(found.values(), default=None)
+
+
+def _other_orders(
+    views: Sequence[VesselImage], options: RunOptions
+) -> dict[tuple[int, int], float]:
+    """Worst disagreement for each two pictures that could have changed places."""
     asked = dataclasses.replace(
         options, pose=dataclasses.replace(options.pose, enabled=False), landmarks=()
     )
-    first, second = views
-    swapped = (
-        dataclasses.replace(first, carm=second.carm),
-        dataclasses.replace(second, carm=first.carm),
-    )
-    return poses_between(swapped, asked)[1].after
+    out = {}
+    for i, j in itertools.combinations(range(len(views)), 2):
+        if views[i].mask.shape == views[j].mask.shape:
+            swapped = list(views)
+            swapped[i] = dataclasses.replace(views[i], carm=views[j].carm)
+            swapped[j] = dataclasses.replace(views[j], carm=views[i].carm)
+            out[i, j] = max(pose.after for pose in poses_between(swapped, asked))
+    return out
 
 
 def order_of(
     views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
 ) -> tuple[list[str], str]:
-    """Judge whether two views' pictures may be swapped; see ``check_order``."""
-    if len(views) != 2:
+    """Judge whether two of the pictures may be swapped; see ``check_order``."""
+    calibrated = all(view.calibrated for view in views)
+    given = max(pose.after for pose in poses)
+    # More views that agree leave no room for another order, and no time is spent on it.
+    if (calibrated or len(views) > 2) and given <= _agreed(views, options):
         return [], ""
-    first, second = views
-    kind, given = kind_of(views), poses[1].after
-    if kind == "exact" and given <= disagreement_limits(kind, options.quality)[0]:
-        return [], ""  # nothing to be asked, and no time spent on it
-    ids, other = (first.view_id, second.view_id), other_order(views, options)
-    return check_order(ids, given, other, kind, options.quality)
+    orders = _other_orders(views, options)
+    if not orders:
+        return [], ""
+    i, j = min(orders, key=lambda pair: orders[pair])
+    ids = views[i].view_id, views[j].view_id
+    return check_order(ids, given, orders[i, j], kind_of(views), options.quality)
+
+
+def _agreed(views: Sequence[VesselImage], options: RunOptions) -> float:
+    """Disagreement up to which nobody asks whether pictures are swapped."""
+    kind = kind_of(views)
+    good = disagreement_limits(kind, options.quality)[0]
+    return good if kind == "exact" else min(good, options.quality.alone_disagreement_raw)

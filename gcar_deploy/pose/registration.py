@@ -12,7 +12,8 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.pose.agreement import agreeing, order_of
 from gcar_deploy.pose.bundling import TreeOf, bundled, posed
 from gcar_deploy.pose.pairwise import Pose
-from gcar_deploy.quality import check_consistency, check_poses, with_hint
+from gcar_deploy.pose.significance import asked
+from gcar_deploy.quality import check_asked, check_consistency, check_poses, with_hint
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,6 +76,11 @@ def register(
     poses = bundled(views, poses, tree_of, options)
     order, hint = order_of(views, poses, options)
     findings += order
+    for one in asked(views, poses, options):
+        ids = views[one.partner].view_id, views[one.view].view_id
+        turn = one.turn_deg, one.turned, one.turn_gain
+        scale = one.scale, one.scaled, one.scale_gain
+        findings += check_asked(ids, one.given, turn, scale, options.quality)
     moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
     findings += check_poses(views, moves, options.quality)
     findings += _unfinished(views, poses)

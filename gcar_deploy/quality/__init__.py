@@ -2,6 +2,7 @@
 
 from gcar_deploy.quality.gates import (
     check_agreement,
+    check_asked,
     check_candidates,
     check_consistency,
     check_order,
@@ -39,6 +40,7 @@ __all__ = [
     "Quality",
     "ViewQuality",
     "check_agreement",
+    "check_asked",
     "check_candidates",
     "check_consistency",
     "check_explained",

@@ -10,6 +10,8 @@ import contextlib
 import itertools
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
@@ -178,6 +180,43 @@ def check_poses(
                 f"{options.good_turn_deg:g} deg are usual)" + (hidden if len(views) == 2 else "")
             )
     return findings
+
+
+def check_asked(
+    view_ids: tuple[str, str], given: float, turn: tuple[float, float, float],
+    scale: tuple[float, float, float], options: QualityOptions,
+) -> list[str]:  # fmt: skip
+    """Judge whether the pictures ask for another angle or scale of the second view.
+
+    Parameters
+    ----------
+    view_ids : of the partner and of the view
+    given : disagreement of both as told, after the best shift, 0 .. 1
+    turn : correction in deg, disagreement with it, and how many times more the squared difference
+        is without it
+    scale : the same with the factor that the view's pixels are too small by
+    """
+
+    def significant(after: float, gain: float) -> bool:
+        clearly = after <= options.asked_ratio * given and gain >= options.asked_gain
+        return clearly and given - after >= options.asked_least
+
+    by_turn = significant(*turn[1:]) and turn[0] > options.good_turn_deg
+    by_scale = significant(*scale[1:]) and abs(np.log(scale[0])) > options.good_scale
+    first, second = view_ids
+    if by_scale and (not by_turn or scale[1] <= turn[1]):
+        return [
+            f"view {second} would agree better with view {first} if its pixels were "
+            f"{abs(scale[0] - 1):.0%} {'larger' if scale[0] > 1 else 'smaller'} ({scale[1]:.0%} of "
+            f"the vessels differ, not {given:.0%}): is its pixel spacing, SDD or SOD wrong?"
+        ]
+    if by_turn:
+        return [
+            f"view {second} would agree better with view {first} if it were turned by "
+            f"{turn[0]:.1f} deg ({turn[1]:.0%} of the vessels differ, not {given:.0%}): is an "
+            "angle of either wrong?"
+        ]
+    return []
 
 
 def check_candidates(count: int, lattice: Grid, options: QualityOptions) -> None:

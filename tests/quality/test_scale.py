@@ -109,6 +109,18 @@ def test_right_scales_pass_and_wrong_ones_are_named():
             check_scale(tree, [picture(tree, factor=factor)])
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "said"),
+    # lumens wider than deep: too long in one view, too short in the other
+    [(1.12, 1.12, "1.1"), (1.12, 0.95, ""), (1.02, 1.0, ""), (1.0, 1.15, "")],
+)
+def test_all_views_together_tell_a_scale_to_a_tenth(first, second, said):
+    tree, across = tube((0.2, 0.1, 1.0)), dataclasses.replace(CARM, primary_angle_deg=60)
+    views = [picture(tree, factor=first), picture(tree, across, factor=second)]
+    found = check_scale(tree, views)
+    assert (said in found[0] and "all views" in found[0]) if said else found == []
+
+
 def test_pictures_without_calibration_are_not_judged():
     tree = tube((1.0, 0.2, 0.6))
     view = dataclasses.replace(picture(tree, factor=3.0), path_error=0.3)

@@ -1,0 +1,143 @@
+"""Whether the pictures ask for another angle, or another scale, of a view than it is told with.
+
+The pose estimate holds angles to their prior: in raw pictures it leaves alone what does not help
+clearly. Here a view is turned, or its pixels are scaled, without any such prior, each beside a
+shift along the line that two views see best (tables move). What is left of the difference of the
+mass profiles is compared with what the shift alone leaves: that is the noise of this very pair.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
+from gcar_deploy.geometry.epipolar import plane_normal
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.pose.agreement import profiled
+from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.pose.profile_fit import MOST_APART_DEG, SEARCH_MM, STEP_MM
+from gcar_deploy.types import Array, Scalars
+
+#: fits go so far at most, standard deviations: shift in mm, two angles in deg, log of the scale
+_REACH = np.array([30.0, 8.0, 8.0, 0.15])
+#: one step of each, which the fit counts in, and the error of a profile as a share of its norm
+_UNIT, _NOISE = np.array([1.0, 1.0, 1.0, 0.02]), 0.1
+_SHIFT, _TURN, _SCALE = [0], [0, 1, 2], [0, 3]
+_MOST_STEPS = 15
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What one view asks for against its partner.
+
+    Attributes
+    ----------
+    view, partner : numbers from 0
+    turn_deg : larger of the two angle corrections
+    scale : factor that the view's pixels are too small by
+    given : disagreement after the best shift alone, 0 .. 1
+    turned, scaled : the same with turn or scale as well
+    turn_gain, scale_gain : how many times more the squared difference is without them
+    """
+
+    view: int
+    partner: int
+    turn_deg: float
+    scale: float
+    given: float
+    turned: float
+    scaled: float
+    turn_gain: float
+    scale_gain: float
+
+
+def asked(
+    views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
+) -> tuple[Asked, ...]:
+    """Ask every view what it would have otherwise, against the partner of its pose.
+
+    Parameters
+    ----------
+    views : V vessel images as they are told
+    poses : V estimated corrections; the partners' are built in
+    options : RunOptions
+    """
+    masses, pose = profiled(views, options)
+    out = []
+    for k, own in enumerate(poses):
+        fixed, moving = masses[own.partner], masses[k]
+        if own.partner == k or fixed is None or moving is None:
+            continue
+        placed = dataclasses.replace(fixed, carm=poses[own.partner].applied(fixed.carm))
+        if separation_deg(placed.carm, moving.carm) < MOST_APART_DEG:
+            out.append(_asked(k, own.partner, _Pair(placed, moving, pose.coarse_mm, pose.fine_mm)))
+    return tuple(out)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two views, and the coarse and fine smoothing of their profiles, mm."""
+
+    fixed: Mass
+    moving: Mass
+    coarse_mm: float
+    fine_mm: float
+
+    def changed(self, x: Array) -> tuple[Mass, CArm]:
+        """Apply shift, primary, secondary and log scale of the pixels to the moving view."""
+        carm = self.moving.carm
+        normal = plane_normal(self.fixed.carm, carm)
+        middle = np.array(carm.principal_point)
+        pixels = middle + np.exp(x[3]) * (self.moving.pixels - middle)
+        if x[1] or x[2]:
+            carm = carm.turned(float(x[1]), float(x[2]))
+        return dataclasses.replace(self.moving, pixels=pixels), carm.moved(x[0] * normal)
+
+    def fitted(self, free: list[int]) -> Array:
+        """(4,) what makes the profiles agree best where only ``free`` may change."""
+
+        def whole(y: Scalars) -> Array:
+            x = np.zeros(4)
+            x[free] = y * _UNIT[free]
+            return x
+
+        def residuals(y: Scalars, sigma_mm: float) -> Scalars:
+            x = whole(y)
+            a, b = mass_profiles(self.fixed, *self.changed(x), sigma_mm)
+            apart = (a - b) / (_NOISE * np.sqrt(float(a @ a)))
+            out: Scalars = np.concatenate([apart, x[free] / _REACH[free]])
+            return out
+
+        starts = np.zeros((round(2 * SEARCH_MM / STEP_MM) + 1, len(free)))
+        starts[:, 0] = np.linspace(-SEARCH_MM, SEARCH_MM, len(starts))
+        y = min(starts, key=lambda s: float(np.sum(residuals(s, self.coarse_mm) ** 2)))
+        for sigma_mm in (2 * self.coarse_mm, self.coarse_mm, self.fine_mm):
+            y = least_squares(
+                residuals, y, args=(sigma_mm,), diff_step=1e-2, max_nfev=_MOST_STEPS
+            ).x
+        return whole(y)
+
+    def left(self, x: Array) -> tuple[float, float]:
+        """Squared difference as a share of the norm, and disagreement."""
+        moving, carm = self.changed(x)
+        return (
+            mismatch(self.fixed, moving, carm, self.fine_mm) ** 2,
+            disagreement(self.fixed, moving, carm, self.fine_mm),
+        )
+
+
+def _asked(view: int, partner: int, pair: _Pair) -> Asked:
+    given = pair.left(pair.fitted(_SHIFT))
+    turn, scale = pair.fitted(_TURN), pair.fitted(_SCALE)
+    turned, scaled = pair.left(turn), pair.left(scale)
+    return Asked(
+        view=view, partner=partner, turn_deg=float(np.abs(turn[1:3]).max()),
+        scale=float(np.exp(scale[3])), given=given[1], turned=turned[1], scaled=scaled[1],
+        turn_gain=given[0] / max(turned[0], 1e-12), scale_gain=given[0] / max(scaled[0], 1e-12),
+    )  # fmt: skip
