@@ -39,6 +39,18 @@ export function label(ctx, text, x, y, color = "#fff", size = 13) {
   ctx.fillStyle = color; ctx.fillText(text, x, y);
 }
 
+/** Write names beside lines: at a place of each where no other stands, the first lines first. */
+export function names(ctx, lines) {
+  const taken = [];
+  for (const [text, at, color] of lines) {
+    const free = [0.5, 0.3, 0.7, 0.85, 0.15].map(share => at[Math.floor(share * (at.length - 1))])
+      .find(([x, y]) => taken.every(([px, py]) => Math.abs(px - x) > 44 || Math.abs(py - y) > 16));
+    if (!free) continue;
+    taken.push(free);
+    label(ctx, text, free[0] + 7, free[1] - 5, color);
+  }
+}
+
 export function ring(ctx, x, y, radius, color, dark = "#000") {
   for (const [wide, ink] of [[5, dark], [2.2, color]]) {
     ctx.lineWidth = wide; ctx.strokeStyle = ink;

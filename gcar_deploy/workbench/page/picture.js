@@ -1,5 +1,5 @@
 // One angiogram: picture, vessels found, strokes, marks and the tree over it; zoom and pan.
-import { colorOf, el, inside, label, nameOf, pen, ring } from "./dom.js";
+import { colorOf, el, inside, nameOf, names, pen, ring } from "./dom.js";
 
 const LENS = 70;
 
@@ -160,10 +160,8 @@ export class Picture {
       const chosen = branch.branch === store.chosen;
       draw(at, chosen ? wide + 1.5 : wide, colorOf(branch.branch));
     }
-    for (const [branch, at] of lines) {
-      const middle = at[at.length >> 1];
-      label(ctx, nameOf(branch), middle[0] + 7, middle[1] - 5, branch.branch === store.chosen ? "#fff" : colorOf(branch.branch));
-    }
+    names(ctx, [...lines].sort(([a], [b]) => (b.branch === store.chosen) - (a.branch === store.chosen))
+      .map(([branch, at]) => [nameOf(branch), at, branch.branch === store.chosen ? "#fff" : colorOf(branch.branch)]));
     const cursor = store.cursor && lines.find(([b]) => b.branch === store.cursor.branch);
     if (cursor) ring(ctx, ...cursor[1][store.cursor.at], 6, "#ffe14d");
   }

@@ -1,5 +1,5 @@
 // The tree in 3D, seen from the detector of a C-arm that is turned by dragging.
-import { colorOf, direction, el, inside, label, nameOf, pen, ring } from "./dom.js";
+import { colorOf, direction, el, inside, label, nameOf, names, pen, ring } from "./dom.js";
 
 const rad = x => x * Math.PI / 180;
 const dot = (p, q) => p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
@@ -115,10 +115,8 @@ export class Scene3D {
       if (wide > 4) stroke(wide * 0.35, shade(paint(branch, i), light, 0.3), "round");
     }
     ctx.lineCap = "round";
-    for (const branch of result.scene.branches) {
-      const [x, y] = put(branch.points[branch.points.length >> 1]);
-      label(ctx, nameOf(branch), x + 8, y - 6);
-    }
+    names(ctx, [...result.scene.branches].sort((a, b) => (b.branch === chosen) - (a.branch === chosen))
+      .map(branch => [nameOf(branch), branch.points.map(put), "#fff"]));
     if (cursor) {
       const [x, y] = put(this.store.branch(cursor.branch).points[cursor.at]);
       ring(ctx, x, y, 7, "#ffe14d");
