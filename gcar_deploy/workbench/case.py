@@ -187,7 +187,7 @@ class Case:
 
 
 #: keys of an order that tell how its pictures are read
-_READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm")
+_READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm", "allow_rescale")
 
 
 @functools.lru_cache(maxsize=8)

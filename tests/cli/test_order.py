@@ -134,6 +134,49 @@ def test_a_table_does_what_its_columns_say(good_case, tmp_path, monkeypatch):
     assert len(result_of(tmp_path / "out" / "marked")["options"]["landmarks"]) == 2
 
 
+def test_a_table_takes_order_files(tmp_path):
+    """Pictures and corrections of the file; what the line and the command say goes before it."""
+    from gcar_deploy.batch.cases import read_cases
+
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "order.json").write_text(
+        json.dumps(
+            {
+                "views": ["a.png", "b.png"],
+                "geometry": "g.json",
+                "out": "result",
+                "force": True,
+                "edits": {"1": [{"do": "erase", "width_px": 9, "points": [[1, 2], [3, 4]]}]},
+                "deleted_mm": [[1, 2, 3]],
+                "refiner": "paper",
+                "masks": {"1": "m.png"},
+            }
+        )
+    )
+    (tmp_path / "c.csv").write_text(
+        "case,geom,view1,view2,order,mask2,refiner\n"
+        "whole,,,,case/order.json,,\n"
+        "other,h.json,c.png,d.png,case/order.json,n.png,none\n"
+    )
+    whole, other = (c.order for c in read_cases(tmp_path / "c.csv", Order(predictor="none")))
+    folder = tmp_path / "case"
+    assert whole.views == (folder / "a.png", folder / "b.png")
+    assert whole.geometry == folder / "g.json" and whole.masks == {1: folder / "m.png"}
+    assert (whole.refiner, whole.predictor, whole.out, whole.force) == (
+        "paper",
+        "none",
+        None,
+        False,
+    )
+    assert whole.deleted_mm == other.deleted_mm == ((1.0, 2.0, 3.0),) and 1 in other.edits
+    assert other.views == (tmp_path / "c.png", tmp_path / "d.png") and other.refiner == "none"
+    assert other.geometry == tmp_path / "h.json"
+    assert other.masks == {1: folder / "m.png", 2: tmp_path / "n.png"}
+    (tmp_path / "c.csv").write_text("case,geom,view1,view2,order\nx,,,,none.json\n")
+    done = gcar("batch", tmp_path / "c.csv", "--out", tmp_path / "o")
+    assert done.code == 2 and "c.csv: line 2: none.json" in done.err
+
+
 @pytest.mark.parametrize(
     ("column", "text", "words"),
     [

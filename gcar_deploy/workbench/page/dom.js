@@ -65,6 +65,9 @@ export const colorOf = branch => COLORS[(branch - 1) % COLORS.length];
 /** Name of a branch: its number, and its vessel where anatomy tells it. */
 export const nameOf = branch => branch.name ? `${branch.branch} ${branch.name}` : String(branch.branch);
 
+/** Whether a place of a branch is left out, so that what is probably a ghost is dashed. */
+export const gapAt = (branch, i) => (branch.ghost?.[i] ?? 0) >= 0.5 && Math.floor(branch.arc[i] / 1.5) % 2 === 1;
+
 /** Clinical name of a direction. */
 export function direction(primary, secondary) {
   const a = Math.round(primary), b = Math.round(secondary);

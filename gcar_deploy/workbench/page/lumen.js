@@ -4,7 +4,7 @@ import { $, colorOf, el, inside, nameOf, pen, ring } from "./dom.js";
 const fixed = (value, digits) => value === null || value === undefined ? "\u2013" : value.toFixed(digits);
 const COLUMNS = [
   ["Vessel", ""], ["Stenosis", "% diameter"], ["", "% area"], ["Least", "mm"], ["Reference", "mm"],
-  ["Lesion", "mm"], ["From ostium", "mm"], ["Length", "mm"], ["\u00b1", "mm"], ["", ""],
+  ["Lesion", "mm"], ["From ostium", "mm"], ["Length", "mm"], ["Ghost", "%"], ["", ""],
 ];
 export const area = percent => percent === null ? null : 100 * (1 - (1 - percent / 100) ** 2);
 
@@ -15,7 +15,8 @@ export function table(store, erase) {
     const { row } = branch, percent = row.stenosis_percent;
     const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
       fixed(row.minimal_diameter_mm, 2), fixed(row.reference_diameter_mm, 2), fixed(row.lesion_length_mm, 1),
-      row.minimal_at_mm === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0), fixed(row.mean_sigma_mm, 2)];
+      row.minimal_at_mm === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
+      row.ghost_probability === null ? "\u2013" : `${Math.round(100 * row.ghost_probability)}`];
     const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
       // Rounded down: what is not certain never reads 100 %.
       row.name ? el("small", { title: "probability of the name by anatomy" }, ` ${Math.floor(100 * row.name_confidence)} %`) : "");
@@ -27,7 +28,7 @@ export function table(store, erase) {
   $("lesions").replaceChildren(
     el("thead", {}, el("tr", {}, ...COLUMNS.map(([name, unit], k) => el("th", { scope: "col" }, name || (k === 9 ? el("span", { class: "swatch", hidden: true }) : "\u00a0"), el("small", {}, unit))))),
     el("tbody", {}, ...rows));
-  $("lesion-note").textContent = "Bold: narrower by half or more. Reference: healthy diameter at the narrowing, by a line through the wider parts. \u00b1: uncertainty of the centreline's place (one standard deviation).";
+  $("lesion-note").textContent = "Bold: narrower by half or more. Reference: healthy diameter at the narrowing, by a line through the wider parts. Ghost: probability that the branch is not there; dashed from a half on.";
 }
 
 /** Choose a branch and mark its narrowing in every drawing. */
@@ -129,7 +130,7 @@ export class Curve {
   }
   said({ branch, start }, i) {
     const reference = branch.reference[i], sigma = branch.sigma[i];
-    return `Branch ${nameOf(branch)} (confidence ${Math.floor(100 * branch.row.confidence)} %), ${(start + branch.arc[i]).toFixed(1)} mm from the ostium: ${(2 * branch.radius[i]).toFixed(2)} mm` +
+    return `Branch ${nameOf(branch)}, ${(start + branch.arc[i]).toFixed(1)} mm from the ostium: ${(2 * branch.radius[i]).toFixed(2)} mm` +
       (reference === null ? "" : `, reference ${(2 * reference).toFixed(2)} mm (${Math.max(0, Math.round(100 * (1 - branch.radius[i] / reference)))} % narrower)`) +
       (sigma === null ? "." : `, \u00b1 ${sigma.toFixed(2)} mm.`);
   }

@@ -1,5 +1,5 @@
 // One angiogram: picture, vessels found, strokes, marks and the tree over it; zoom and pan.
-import { colorOf, el, inside, nameOf, names, pen, ring } from "./dom.js";
+import { colorOf, el, gapAt, inside, nameOf, names, pen, ring } from "./dom.js";
 
 const LENS = 70;
 
@@ -150,15 +150,15 @@ export class Picture {
   tree(ctx) {
     const { store } = this, scene = store.result.scene;
     const lines = scene.branches.map(b => [b, this.line(b).map(p => this.put(p))]);
-    const draw = (at, wide, ink) => {
+    const draw = (branch, at, wide, ink) => {
       ctx.lineWidth = wide; ctx.strokeStyle = ink; ctx.beginPath();
-      at.forEach((p, i) => ctx[i ? "lineTo" : "moveTo"](...p)); ctx.stroke();
+      at.forEach((p, i) => ctx[i && !gapAt(branch, i) ? "lineTo" : "moveTo"](...p)); ctx.stroke();
     };
     const wide = this.look.width;
-    for (const [, at] of lines) draw(at, wide + 2.5, "#000b");
+    for (const [branch, at] of lines) draw(branch, at, wide + 2.5, "#000b");
     for (const [branch, at] of lines) {
       const chosen = branch.branch === store.chosen;
-      draw(at, chosen ? wide + 1.5 : wide, colorOf(branch.branch));
+      draw(branch, at, chosen ? wide + 1.5 : wide, colorOf(branch.branch));
     }
     names(ctx, [...lines].sort(([a], [b]) => (b.branch === store.chosen) - (a.branch === store.chosen))
       .map(([branch, at]) => [nameOf(branch), at, branch.branch === store.chosen ? "#fff" : colorOf(branch.branch)]));

@@ -1,5 +1,5 @@
 // The tree in 3D, seen from the detector of a C-arm that is turned by dragging.
-import { colorOf, direction, el, inside, label, nameOf, names, pen, ring } from "./dom.js";
+import { colorOf, direction, el, gapAt, inside, label, nameOf, names, pen, ring } from "./dom.js";
 
 const rad = x => x * Math.PI / 180;
 const dot = (p, q) => p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
@@ -101,7 +101,7 @@ export class Scene3D {
     const { u, v, scale, put } = this.screen(), paint = this.paint(), pieces = [];
     for (const branch of result.scene.branches) {
       const at = branch.points.map(put);
-      for (let i = 0; i + 1 < at.length; i++) pieces.push([(at[i][2] + at[i + 1][2]) / 2, at[i], at[i + 1], branch, i]);
+      for (let i = 0; i + 1 < at.length; i++) if (!gapAt(branch, i)) pieces.push([(at[i][2] + at[i + 1][2]) / 2, at[i], at[i + 1], branch, i]);
     }
     // Nearest to the detector last: pictures are seen from there.
     pieces.sort((p, q) => p[0] - q[0]);
