@@ -114,7 +114,9 @@ class Reconstruction:
     @functools.cached_property
     def pressure(self) -> PressureDrop:
         """Pd/Pa along each branch at the usual assumed flow."""
-        doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches))
+        found = () if self.quality.ghosts is None else self.quality.ghosts.probable
+        ghosts = {ghost.branch: ghost.probability for ghost in found}
+        doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches), ghosts)
         names = [None if name is None else name.name for name in self.names]
         return pressure_drop(self.tree, self.measured.lumens, doubts=doubts, names=names)
 
@@ -176,7 +178,7 @@ class Reconstruction:
     @functools.cached_property
     def _summary(self) -> dict[str, Any]:
         reasons: dict[str, str] = {}
-        further = self.measured.further
+        further, pressure = self.measured.further, pressure_table(self.pressure)
         body: dict[str, Any] = {
             "schema": SCHEMA,
             "status": self.quality.status,
@@ -194,7 +196,7 @@ class Reconstruction:
                 "bifurcations": self._bifurcations(),
             },
             "ambiguity": self._ambiguity(),
-            "pressure": pressure_table(self.pressure),
+            "pressure": pressure,
             "volume": {
                 "center_mm": list(self.grid.center_mm),
                 "size_mm": list(self.grid.size_mm),
@@ -223,7 +225,7 @@ class Reconstruction:
                 reasons[path] = "known of two views with the predictor that sees both alone"
             if path.startswith("/pressure/branches/"):
                 k = int(path.split("/")[3])
-                reasons[path] = body["pressure"]["branches"][k]["withheld"]
+                reasons[path] = pressure["branches"][k]["withheld"]
         if self.model is None:
             reasons["/model"] = "made without a model"
         if self.ending is None:

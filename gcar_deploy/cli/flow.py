@@ -78,7 +78,9 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
         check_target(out, force=force, inputs=(result,))
     stored = read_folder(result)
     tree, told = stored.tree, stored.summary
-    doubts = doubts_of(told["status"], told["sentence"], len(tree.branches))
+    found = told.get("ambiguity", {}).get("probable_ghosts", ())
+    ghosts = {ghost["branch"] - 1: ghost["probability"] for ghost in found}
+    doubts = doubts_of(told["status"], told["sentence"], len(tree.branches), ghosts)
     names = [branch.get("name") for branch in told["tree"]["branches"]]
     lumens = [branch_lumen(branch) for branch in tree.branches]
     drop = pressure_drop(tree, lumens, assumed, doubts, names)

@@ -85,6 +85,7 @@ def test_a_degraded_result_tells_nothing():
     for vessel in pressure_drop(tree, lumens, doubts=doubts_of("degraded", "Why.", 3)).vessels:
         assert vessel.withheld == "the result is degraded: Why." and not vessel.told.any()
     assert doubts_of("ok", "Fine.", 3) == {}
+    assert doubts_of("ok", "Fine.", 3, {1: 0.9}) == {1: "it is a ghost with probability 0.90"}
 
 
 def test_a_doubt_goes_downstream_and_not_beside():
