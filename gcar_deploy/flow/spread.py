@@ -7,8 +7,9 @@ over:
     sigma^2 = FLOOR^2 + (SHARE d)^2 + (NARROW n)^2,  mean = d - LOST n,  n = healthy - d.
 
 Errors along a vessel go together. A part is common to a branch (calibration, threshold), the rest
-changes over ``REACH_MM``. The constants are fitted to generated trees by ``gcar-export flow-table
---fit``, and judged on others; they belong to the present fit of the lumen.
+changes over ``REACH_MM``. The constants were chosen by hand, for coverage on generated trees (seeds
+apart from those that are reported), beside what ``gcar-export flow-table --fit`` finds most likely;
+they belong to the present fit of the lumen.
 """
 
 from __future__ import annotations
