@@ -67,9 +67,12 @@ def cost_curves() -> None:
 @click.option("--seed", default=1, show_default=True, help="Population of generated trees.")
 @click.option("--trees", default=10, show_default=True, help="Trees per row.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
+@click.option("--pictures", default="clean,degraded,mask,raw", show_default=True)
 @click.option("--predictors", default="multi,none", show_default=True)
 @click.option("--parts", is_flag=True, help="Also what sigma is worth without some of its parts.")
-def sigma_table(seed: int, trees: int, protocols: str, predictors: str, parts: bool) -> None:
+def sigma_table(
+    seed: int, trees: int, protocols: str, pictures: str, predictors: str, parts: bool
+) -> None:
     """Compare the stated sigma with true errors on generated trees.
 
     Example: gcar-export sigma-table --seed 2 --trees 20
@@ -79,7 +82,7 @@ def sigma_table(seed: int, trees: int, protocols: str, predictors: str, parts: b
     cells = [
         (protocol, condition, predictor)
         for protocol in words(protocols)
-        for condition in sigma.CONDITIONS
+        for condition in words(pictures)
         for predictor in words(predictors)
     ]
     rows = []

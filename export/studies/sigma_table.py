@@ -2,12 +2,11 @@
 
 Every view after the first is turned and moved by draws from the prior that sigma includes
 (``geometry.prior.LEFT_DEG``, ``LEFT_MM``); the reconstruction is told nothing of it. For each
-centreline point, e is its distance from the true centreline and sigma the stated standard
-deviation in the worst direction across the vessel. Points further than ``GHOST_MM`` from any
-vessel are ghosts: no sigma speaks of them, and their share stands beside.
+centreline point, e is its way to the true centreline and C the stated covariance across the
+vessel, two axes: z^2 = e^T C^-1 e / 2. Points further than ``GHOST_MM`` from any vessel are ghosts:
+no covariance speaks of them, so they are left out of one mean and counted in another.
 
-Sigma has three parts, added in quadrature: what the fit's own equations say, the prior on the
-geometry, and the pixel's share. ``calibrate_parts`` leaves them out one by one.
+The covariance has two parts that add: what the fit leaves open, and what the geometry does.
 """
 
 from __future__ import annotations
@@ -27,23 +26,21 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.result import Result
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes.fit import PIXEL_SHARE
-from gcar_deploy.tubes.uncertainty import geometry_sigma
 from gcar_deploy.types import Array
-from gcar_export.scenes.protocols import MM_PER_COUNT, case_geometry
+from gcar_export.scenes.protocols import MASK_PATH_MM, MM_PER_COUNT, case_geometry
+from gcar_export.scenes.raw_pictures import raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import SyntheticTree, random_tree
 
 #: further off than this is another vessel or none, mm
 GHOST_MM = 5.0
-#: share of 95 % of a Gaussian, standard deviations
-Z95 = 1.96
-CONDITIONS = ("clean", "degraded")
-#: what sigma is made of, part after part; the last is the sigma that a result states
-PARTS = ("fit alone", "fit, geometry", "fit, geometry, pixel")
+#: squared length that 95 % of a standard Gaussian in two dimensions stay within, per axis
+CHI95 = 5.991 / 2
+CONDITIONS = ("clean", "degraded", "mask", "raw")
+#: what the covariance is made of, part after part; the last is what a result states
+PARTS = ("fit alone", "fit, geometry")
 #: noise of degraded pictures: share of the path, and mm
 NOISE_SHARE, NOISE_MM = 0.08, 0.15
 
@@ -57,8 +54,9 @@ class Calibration:
     protocol, condition, predictor : what the cell is
     parts : of sigma that are in it, one of ``PARTS``
     trees, points : how many went in; ``refused`` trees did not
-    mean_z2 : mean of (e / sigma)^2, 1 where sigma is right
-    coverage : share of points with e <= 1.96 sigma
+    mean_z2 : mean of z^2 per axis, 1 where the covariance is right
+    mean_z2_all : the same with ghosts counted
+    coverage : share of points within the ellipse that 95 % should be in
     rmse_mm, sigma_mm : root mean squares of e and of sigma
     ghosts : share of points further than ``GHOST_MM`` from any vessel, left out above
     refused : trees
@@ -71,6 +69,7 @@ class Calibration:
     trees: int
     points: int
     mean_z2: float
+    mean_z2_all: float
     coverage: float
     rmse_mm: float
     sigma_mm: float
@@ -110,7 +109,7 @@ def calibrate_parts(
     Parameters
     ----------
     protocol : ``paper`` or ``clinical``
-    condition : ``clean`` or ``degraded`` (noise on the path lengths)
+    condition : ``clean``, ``degraded`` (noise on the path lengths), ``mask`` or ``raw``
     predictor : ``multi`` or ``none``
     seed : of the trees; another seed is another population
     trees : how many
@@ -121,7 +120,7 @@ def calibrate_parts(
         predict=dataclasses.replace(options.predict, predictor=cast(PredictorName, predictor)),
     )
     engine = Engine(options=options)
-    errors, sigmas, refused = [], [], 0
+    errors, judged, refused = [], [], 0
     for k in range(trees):
         rng = np.random.default_rng([seed, k])
         tree = random_tree(rng)
@@ -133,17 +132,17 @@ def calibrate_parts(
         except GcarError:
             refused += 1
         else:
-            errors.append(point_errors(result.tree, tree)[0])
-            sigmas.append(sigma_parts(result))
+            error, *of_tree = judged_points(result.tree, tree)
+            errors.append(error)
+            judged.append(of_tree)
         if on_tree is not None:
             on_tree()
     e = np.concatenate([np.zeros(0), *errors])
     near = e < GHOST_MM
     cells = []
-    for parts, sigma in zip(
-        PARTS, np.concatenate([np.zeros((3, 0)), *sigmas], axis=1), strict=True
-    ):
-        z = e[near] / sigma[near]
+    for k, parts in enumerate(PARTS):
+        z2 = np.concatenate([np.zeros(0), *(of_tree[0][k] for of_tree in judged)])
+        sigma = np.concatenate([np.zeros(0), *(of_tree[1][k] for of_tree in judged)])
         cells.append(
             Calibration(
                 protocol=protocol,
@@ -152,51 +151,55 @@ def calibrate_parts(
                 parts=parts,
                 trees=trees,
                 points=int(near.sum()),
-                mean_z2=float(np.mean(z**2)) if len(z) else float("nan"),
-                coverage=float(np.mean(z <= Z95)) if len(z) else float("nan"),
-                rmse_mm=float(np.sqrt(np.mean(e[near] ** 2))) if len(z) else float("nan"),
-                sigma_mm=float(np.sqrt(np.mean(sigma[near] ** 2))) if len(z) else float("nan"),
-                ghosts=float(np.mean(~near)) if len(e) else float("nan"),
+                mean_z2=_mean(z2[near]),
+                mean_z2_all=_mean(z2),
+                coverage=_mean(z2[near] <= CHI95),
+                rmse_mm=_mean(e[near] ** 2) ** 0.5,
+                sigma_mm=_mean(sigma[near] ** 2) ** 0.5,
+                ghosts=_mean(~near),
                 refused=refused,
             )
         )
     return cells
 
 
-def sigma_parts(result: Result) -> Array:
-    """(3, n) sigma of each centreline point, mm, made of more and more of ``PARTS``.
+def _mean(values: Array) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
 
-    What the result states is taken apart: geometry and pixel are worked out again, and what they
-    leave is the fit's.
+
+def judged_points(made: Tree, truth: SyntheticTree) -> tuple[Array, Array, Array]:
+    """Compare the points of a tree with the true centreline.
+
+    Returns
+    -------
+    error : (n,) distance, mm
+    z2 : (2, n) z^2 per axis against more and more of ``PARTS``
+    sigma : (2, n) worst direction of those, mm
     """
-    carms = [view.carm for view in result.views]
-    stated = np.concatenate([branch.sigma_mm for branch in result.tree.branches])
-    geometry = geometry_sigma(result.tree.points(), carms)
-    pixel = PIXEL_SHARE * max(carm.pixel_at_isocenter_mm for carm in carms)
-    fit = np.sqrt(np.maximum(stated**2 - geometry**2 - pixel**2, 0.0))
-    return np.stack([fit, np.hypot(fit, geometry), stated])
-
-
-def point_errors(made: Tree, truth: SyntheticTree) -> tuple[Array, Array]:
-    """(n,) distance of each centreline point from the true centreline, and its sigma, mm."""
     dense = np.concatenate([resample(v.points_mm, 0.1) for v in truth.vessels])
-    error = cKDTree(dense).query(made.points())[0]
-    return error, np.concatenate([b.sigma_mm for b in made.branches])
+    points = made.points()
+    error, nearest = cKDTree(dense).query(points)
+    off = points - dense[nearest]
+    each = [b.covariance_mm2 for b in made.branches if b.covariance_mm2 is not None]
+    covariance = np.cumsum(np.concatenate(each), axis=1)
+    inverse = np.linalg.pinv(covariance, rcond=1e-6, hermitian=True)
+    z2 = np.einsum("ni,npij,nj->pn", off, inverse, off) / 2
+    return error, z2, np.sqrt(np.linalg.eigvalsh(covariance)[..., -1]).T
 
 
 def table(rows: Sequence[Calibration]) -> str:
     """Markdown."""
     lines = [
         "| set-up | pictures | predictor | sigma of | trees | points | mean z^2 "
-        "| within 1.96 sigma % | RMSE mm | sigma mm | ghosts % |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| within the 95 % ellipse % | RMSE mm | sigma mm | ghosts % | mean z^2 with them |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         used = f"{r.trees - r.refused} of {r.trees}" if r.refused else f"{r.trees}"
         lines.append(
             f"| {r.protocol} | {r.condition} | {r.predictor} | {r.parts} | {used} | {r.points} "
             f"| {r.mean_z2:.2f} | {100 * r.coverage:.1f} | {r.rmse_mm:.2f} | {r.sigma_mm:.2f} "
-            f"| {100 * r.ghosts:.1f} |"
+            f"| {100 * r.ghosts:.1f} | {r.mean_z2_all:.2f} |"
         )
     return "\n".join(lines)
 
@@ -219,16 +222,21 @@ def _pictures(
         if condition == "degraded":
             noise = rng.normal(0.0, 1.0, path.shape) * (NOISE_MM + NOISE_SHARE * path)
             path = np.where(path > 0.3, np.maximum(path + noise, 0.0), 0.0)
-        counts = np.rint(path / MM_PER_COUNT).astype(np.float32)
+        counts, depth = np.rint(path / MM_PER_COUNT).astype(np.float32), 16
+        intensity = Intensity(kind="path_length", polarity="bright", mm_per_count=MM_PER_COUNT)
+        if condition == "mask":
+            counts, depth = 255 * (path > MASK_PATH_MM).astype(np.float32), 8
+            intensity = Intensity(kind="mask", polarity="bright", mm_per_count=None)
+        if condition == "raw":
+            counts, depth = raw_picture(path, rng).astype(np.float32), 8
+            intensity = Intensity(kind="raw", polarity="dark", mm_per_count=None)
         out.append(
             Angiogram(
                 view_id=str(number + 1),
                 carm=carm,
                 pixels=counts,
-                bit_depth=16,
-                intensity=Intensity(
-                    kind="path_length", polarity="bright", mm_per_count=MM_PER_COUNT
-                ),
+                bit_depth=depth,
+                intensity=intensity,
                 sha256=hashlib.sha256(counts.tobytes()).hexdigest(),
             )
         )

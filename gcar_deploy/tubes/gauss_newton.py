@@ -36,7 +36,7 @@ MAX_LOG_STEP = 0.4
 #: rejected steps in a row after which a level gives up.
 MAX_REJECTED = 5
 #: share of its length that a step keeps in the next one; single ratios jump with the damping
-SHRINK = 5 / 6
+SHRINK = 3 / 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

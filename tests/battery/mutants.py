@@ -200,22 +200,46 @@ MUTANTS = (
     Mutant(
         "sigma: half of what a result states",
         "gcar_deploy/tubes/fit.py",
-        "sigma = np.sqrt(own**2 + geometry**2 + pixel**2)",
-        "sigma = 0.5 * np.sqrt(own**2 + geometry**2 + pixel**2)",
+        "covariance = np.stack([parts.fit, parts.geometry], axis=1)",
+        "parts = type(parts)(parts.fit / 4, parts.geometry / 4)\n"
+        "    covariance = np.stack([parts.fit, parts.geometry], axis=1)",
         (f"{_SIGMA}::test_errors_of_whole_fits_are_those_that_sigma_states",),
     ),
     Mutant(
         "sigma: half of the fit's part",
         "gcar_deploy/tubes/uncertainty.py",
-        "sigma = np.sqrt(np.maximum(largest, 0.0) * CORRELATED_PIXELS)",
-        "sigma = 0.5 * np.sqrt(np.maximum(largest, 0.0) * CORRELATED_PIXELS)",
-        (f"{_SIGMA}::test_fit_sigma_is_the_cramer_rao_bound_of_a_rigid_tube",),
+        "return 0.5 * (out + np.swapaxes(out, 1, 2))",
+        "return 0.125 * (out + np.swapaxes(out, 1, 2))",
+        (f"{_SIGMA}::test_depth_and_plane_of_a_rigid_tube_are_the_cramer_rao_bounds",),
+    ),
+    Mutant(
+        "sigma: half of it in depth",
+        "gcar_deploy/tubes/uncertainty.py",
+        "    out: Array = solved[row[:, :, None], back[:, None, :]]\n",
+        "    out: Array = solved[row[:, :, None], back[:, None, :]] * [[1, .5, 1], [.5, .25, .5], "
+        "[1, .5, 1]]\n",
+        (f"{_SIGMA}::test_depth_and_plane_of_a_rigid_tube_are_the_cramer_rao_bounds",),
+    ),
+    Mutant(
+        "sigma: half of it across the beams' bisector",
+        "gcar_deploy/tubes/uncertainty.py",
+        "    out: Array = solved[row[:, :, None], back[:, None, :]]\n",
+        "    out: Array = solved[row[:, :, None], back[:, None, :]] * [[.25, .5, .5], [.5, 1, 1], "
+        "[.5, 1, 1]]\n",
+        (f"{_SIGMA}::test_depth_and_plane_of_a_rigid_tube_are_the_cramer_rao_bounds",),
+    ),
+    Mutant(
+        "sigma: vessels that share rays do not couple",
+        "gcar_deploy/tubes/hessian.py",
+        "    for step in range(1, int(rank.max(initial=0)) + 1):",
+        "    for step in range(1, 1):",
+        ("tests/tubes/test_hessian.py",),
     ),
     Mutant(
         "sigma: half of the geometry's part",
         "gcar_deploy/tubes/uncertainty.py",
-        "return np.sqrt(total)",
-        "return 0.5 * np.sqrt(total)",
+        "    out: Array = here @ np.linalg.inv(inverse) @ np.swapaxes(here, 1, 2)",
+        "    out: Array = here @ np.linalg.inv(4 * inverse) @ np.swapaxes(here, 1, 2)",
         (_SIGMA,),
     ),
     Mutant(

@@ -9,7 +9,7 @@ pytest.importorskip("numba")
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.selftest import tiny_case, tiny_tree
+from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.targets import make_targets
 from gcar_export.scenes.trees import SyntheticTree, Vessel
@@ -17,6 +17,7 @@ from gcar_export.studies import refine_table as refining
 from gcar_export.studies import sigma_table as sigma
 from gcar_export.studies.cost_curves import Curve
 from tests.export.label_files import write_tree
+from tests.tree.shapes import branch
 
 
 def test_exponent_of_a_power_law():
@@ -57,18 +58,19 @@ def test_true_points_give_the_tree_back_and_noise_costs(tmp_path, monkeypatch):
     assert refining.refine_rows(*arguments) == rows and len(calls) == 2
 
 
-def test_errors_are_measured_from_the_true_centreline():
-    made = tiny_tree()
-    vessels = tuple(Vessel("v", "left", b.points_mm, b.radius_mm) for b in made.branches)
-    truth = SyntheticTree(vessels, "right")
-    shifted = Tree(
-        nodes_mm=made.nodes_mm,
-        branches=tuple(
-            dataclasses.replace(b, sigma_mm=np.full(len(b), 0.5)) for b in made.branches
-        ),
-    )
-    error, said = sigma.point_errors(shifted, truth)
-    assert error.max() < 0.06 and (said == 0.5).all()
+def test_errors_are_judged_by_the_ellipse_across_the_vessel():
+    """A tree moved by (0.3, 0.4): by its covariance in depth alone, or in both axes."""
+    line = np.stack([np.zeros(41), np.zeros(41), np.linspace(-20, 20, 41)], axis=1)
+    truth = SyntheticTree((Vessel("v", "left", line, np.ones(41)),), "right")
+    parts = np.stack([np.diag([0.09, 0.04, 0.0]), np.diag([0.0, 0.12, 0.0])])
+    moved = branch(line + np.array([0.3, 0.4, 0.0]), 1.0)
+    moved = dataclasses.replace(moved, covariance_mm2=np.tile(parts, (41, 1, 1, 1)))
+    made = Tree(nodes_mm=moved.points_mm[[0, -1]], branches=(moved,))
+    error, z2, said = sigma.judged_points(made, truth)
+    np.testing.assert_allclose(error, 0.5, atol=1e-6)
+    np.testing.assert_allclose(z2[0], 0.5 * (0.3**2 / 0.09 + 0.4**2 / 0.04))
+    np.testing.assert_allclose(z2[1], 0.5 * (0.3**2 / 0.09 + 0.4**2 / 0.16))
+    np.testing.assert_allclose(said, [[0.3] * 41, [0.4] * 41])
 
 
 @pytest.mark.slow
@@ -84,11 +86,8 @@ def test_calibration_counts_trees_and_points():
 def test_sigma_is_the_sum_of_its_parts():
     cells = sigma.calibrate_parts("paper", "clean", "multi", seed=3, trees=1)
     assert [cell.parts for cell in cells] == list(sigma.PARTS)
-    fit, geometry, whole = cells
-    # Each part widens sigma, so less lies outside of it; the errors stay what they are.
-    assert fit.sigma_mm < geometry.sigma_mm < whole.sigma_mm
-    assert fit.mean_z2 > geometry.mean_z2 > whole.mean_z2
-    assert fit.coverage <= geometry.coverage <= whole.coverage
+    fit, whole = cells
+    # The geometry widens the ellipse, so less lies outside of it; the errors stay what they are.
+    assert fit.sigma_mm < whole.sigma_mm
+    assert fit.mean_z2 > whole.mean_z2 and fit.coverage <= whole.coverage
     assert fit.rmse_mm == whole.rmse_mm
-    # In quadrature, by a road of its own: 0.45 of a pixel of 1.40625 mm at the isocentre.
-    assert whole.sigma_mm**2 - geometry.sigma_mm**2 == pytest.approx((0.45 * 1.40625) ** 2)
