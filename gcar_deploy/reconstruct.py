@@ -17,7 +17,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.vessels import find_vessels
-from gcar_deploy.measure import from_inlets
+from gcar_deploy.measure import from_inlets, measure_sections, read_signal, with_diameters
 from gcar_deploy.pose import landmark_pixels, marked_places, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import check_candidates, check_tree, check_views, judge
@@ -30,7 +30,7 @@ from gcar_deploy.tubes import refine, refined_volume
 #: stages with their usual share of the time
 STAGES = (
     ("vessels", 3.0), ("pose", 2.0), ("candidates", 1.0), ("centers", 2.0), ("refine", 6.0),
-    ("tree", 1.0), ("quality", 0.5),
+    ("tree", 1.0), ("quality", 0.5), ("diameters", 0.5),
 )  # fmt: skip
 
 
@@ -135,8 +135,13 @@ def _reconstructed(
             tree, placed.views, findings, options,
             disagreement=placed.disagreement, evidence=centers.evidence,
         )  # fmt: skip
+    with watch.stage("diameters", keep_if_late=True):
+        signals = [read_signal(a, v) for a, v in zip(angiograms, placed.views, strict=True)]
+        sections = measure_sections(tree, signals)
+        tree = with_diameters(tree, sections)
     return Reconstruction(
-        quality=judged, tree=tree, gaussians=refined.gaussians, volume=volume, grid=grid,
+        quality=judged, tree=tree, sections=sections, gaussians=refined.gaussians,
+        volume=volume, grid=grid,
         angiograms=tuple(angiograms), views=placed.views, poses=placed.poses,
         seconds={**watch.seconds, "total": watch.elapsed_s},
         counts={

@@ -25,7 +25,7 @@ from gcar_deploy.geometry.observability import (
     silent_errors,
 )
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.measure import BranchName, Measured, measured
+from gcar_deploy.measure import BranchName, Measured, Sections, measured
 from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
@@ -42,7 +42,7 @@ _PACKAGES = (
 )  # fmt: skip
 _LUMEN = (
     "/minimal_diameter_mm", "/minimal_at_mm", "/reference_diameter_mm", "/stenosis_percent",
-    "/lesion_length_mm",
+    "/lesion_length_mm", "/minimal_sigma_mm", "/area_stenosis_percent", "/plaque_free_mm",
 )  # fmt: skip
 
 
@@ -54,6 +54,7 @@ class Reconstruction:
     ----------
     quality : Quality
     tree : Tree, mm LPS; branches run from their inlets (``measure.inlet``)
+    sections : of each branch, the diameters that the pictures show; None: the radii of the tree
     gaussians : Gaussians
     volume : (nx, ny, nz) float32 vessel occupancy 0 .. 1 on ``grid``
     grid : Grid
@@ -73,6 +74,7 @@ class Reconstruction:
 
     quality: Quality
     tree: Tree
+    sections: tuple[Sections, ...] | None
     gaussians: Gaussians
     volume: Volume
     grid: Grid
@@ -109,7 +111,7 @@ class Reconstruction:
     @functools.cached_property
     def measured(self) -> Measured:
         """Lumen, names, angles, foreshortening and the view to take next."""
-        return measured(self.tree, self.views)
+        return measured(self.tree, self.views, self.sections, self.options.lesions)
 
     @functools.cached_property
     def pressure(self) -> PressureDrop:
@@ -184,7 +186,7 @@ class Reconstruction:
             "status": self.quality.status,
             "sentence": self.quality.sentence,
             "findings": list(self.quality.findings),
-            "notes": list(self.notes),
+            "notes": [*self.notes, *self.measured.unplaced],
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],
@@ -288,6 +290,13 @@ class Reconstruction:
             )
             pair = [angle.first + 1, angle.second + 1]
             node["angles"].append({"branches": pair, "angle_deg": angle.angle_deg})
+        for bifurcation in self.measured.bifurcations:
+            node = found[bifurcation.node]
+            node["calibre_ratio"] = bifurcation.calibre_ratio
+            node["segments"] = [
+                {**dataclasses.asdict(segment), "branch": segment.branch + 1}
+                for segment in bifurcation.segments
+            ]
         return list(found.values())
 
     def _view(self, k: int) -> dict[str, Any]:
@@ -352,6 +361,12 @@ def _branch(
         "reference_diameter_mm": lumen.reference_diameter_mm,
         "stenosis_percent": lumen.stenosis_percent,
         "lesion_length_mm": lumen.lesion_length_mm,
+        "minimal_sigma_mm": lumen.minimal_sigma_mm,
+        "area_stenosis_percent": lumen.area_stenosis_percent,
+        "lesion_mm": lumen.lesion_mm,
+        "proximal_reference_mm": lumen.proximal_reference_mm,
+        "distal_reference_mm": lumen.distal_reference_mm,
+        "plaque_free_mm": lumen.plaque_free_mm,
     }
 
 

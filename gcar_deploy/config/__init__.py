@@ -44,6 +44,7 @@ __all__ = [
     "DicomOptions",
     "ImagingOptions",
     "Landmark",
+    "LesionBorders",
     "ModelLimits",
     "PaperOptions",
     "PictureLimits",
@@ -61,6 +62,15 @@ __all__ = [
 
 #: (col, row) of one point in each view, None where it is not seen
 Landmark: TypeAlias = tuple[tuple[float, float] | None, ...]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LesionBorders:
+    """Borders of one lesion: number of the view from 1, (col, row) of both ends in it."""
+
+    view: int
+    proximal: tuple[float, float]
+    distal: tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,3 +92,5 @@ class RunOptions:
     ostia: tuple[Landmark, ...] = ()
     #: a place on each branch that is to go, mm LPS, in the order of deletion
     deleted_mm: tuple[tuple[float, float, float], ...] = ()
+    #: borders of lesions marked in a picture; they win over those that are found
+    lesions: tuple[LesionBorders, ...] = ()

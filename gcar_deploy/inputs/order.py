@@ -17,6 +17,7 @@ from gcar_deploy.config import (
     SEGMENTERS,
     DicomOptions,
     Landmark,
+    LesionBorders,
     RunOptions,
 )
 from gcar_deploy.config.ranges import Range, check_field, check_number
@@ -71,6 +72,7 @@ class Order:
     same_branch : a place on one vessel in each view, not the same place of it, or None
     ostia : where arteries begin, points as of ``landmarks``
     deleted_mm : a place on each branch that is to go, mm LPS, in the order of deletion
+    lesions : borders of lesions, which win over those that are found
     frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
     pixel_spacing_mm, sod_mm : for DICOM that does not say it, at the detector
     allow_rescale : take a picture of another size than its geometry's for a rescaled one
@@ -92,6 +94,7 @@ class Order:
     same_branch: tuple[Landmark, ...] | None = None
     ostia: tuple[Landmark, ...] | None = None
     deleted_mm: tuple[tuple[float, float, float], ...] | None = None
+    lesions: tuple[LesionBorders, ...] | None = None
     frames: tuple[int | None, ...] | None = None
     pixel_spacing_mm: float | None = None
     sod_mm: float | None = None
@@ -170,7 +173,7 @@ class Order:
             pose=dataclasses.replace(base.pose, **pose),
             predict=dataclasses.replace(base.predict, **_given(self, "predictor")),
             refine=dataclasses.replace(base.refine, **_given(self, "refiner")),
-            **_given(self, "landmarks", "same_branch", "ostia", "deleted_mm"),
+            **_given(self, "landmarks", "lesions", "same_branch", "ostia", "deleted_mm"),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -236,6 +239,9 @@ def check_views(order: Order) -> None:
         raise UsageError(f"{count} picture given; two or more are needed")
     if count > MOST_VIEWS:
         raise UsageError(f"{count} pictures given; at most {MOST_VIEWS} are taken")
+    for lesion in order.lesions or ():
+        if not 1 <= lesion.view <= count:
+            raise UsageError(f"lesions.view = {lesion.view}: there are views 1 .. {count}")
     for what, named in (("mask", order.masks), ("edits", order.edits), ("region", order.regions)):
         for k in named:
             if not 1 <= k <= count:
@@ -255,7 +261,7 @@ def _order(values: Any) -> Order:
         "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,
         "edits": parse_edits, "regions": parse_regions, "ostia": _landmarks,
         "same_branch": _landmarks,
-        "deleted_mm": _deleted,
+        "deleted_mm": _deleted, "lesions": _lesions,
         "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
         "force": _truth, "allow_rescale": _truth, "out": _path, "extras": _texts,
     }  # fmt: skip
@@ -306,6 +312,24 @@ def _deleted(key: str, value: Any) -> tuple[tuple[float, float, float], ...]:
     return tuple((x, y, z) for x, y, z in places)
 
 
+def _lesions(key: str, value: Any) -> tuple[LesionBorders, ...]:
+    out = []
+    for one in _list(key, value, "lesions"):
+        check_object(key, one, ("view", "proximal", "distal"))
+        missing = [name for name in ("view", "proximal", "distal") if name not in one]
+        if missing:
+            raise UsageError(f"{key}: {quote(one)} has no {missing[0]}")
+        out.append(
+            LesionBorders(
+                view=whole(f"{key}.view", one["view"]),
+                proximal=parse_point(f"{key}.proximal", one["proximal"]),
+                distal=parse_point(f"{key}.distal", one["distal"]),
+            )
+        )
+    return tuple(out)
+
+
+
 def _frames(key: str, value: Any) -> tuple[int | None, ...]:
     entries = _list(key, value, "frames")
     return tuple(None if frame is None else whole(key, frame) for frame in entries)
@@ -334,6 +358,8 @@ def _plain(value: Any) -> Any:
         return value.to_dict()
     if isinstance(value, tuple):
         return [_plain(one) for one in value]
+    if isinstance(value, LesionBorders):
+        return _plain(dataclasses.asdict(value))
     if isinstance(value, Mapping):
         return {str(key): _plain(one) for key, one in value.items()}
     return value

@@ -3,5 +3,16 @@
 from gcar_deploy.measure.inlet import from_inlets
 from gcar_deploy.measure.measured import Measured, measured
 from gcar_deploy.measure.naming import BranchName
+from gcar_deploy.measure.sections import Sections, measure_sections, with_diameters
+from gcar_deploy.measure.signals import read_signal
 
-__all__ = ["BranchName", "Measured", "from_inlets", "measured"]
+__all__ = [
+    "BranchName",
+    "Measured",
+    "Sections",
+    "from_inlets",
+    "measure_sections",
+    "measured",
+    "read_signal",
+    "with_diameters",
+]

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.measure.borders import between_borders
+from gcar_deploy.measure.reference import reference_lines
+from gcar_deploy.measure.sections import Sections, sections_of_radii
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Scalars
+from gcar_deploy.types import Array, Scalars
 
 #: a stretch this much narrower than its reference (share) counts as lesion.
 LESION_SHARE = 0.25
-#: share of a branch's diameters that lie below its reference line (expectile).
-REFERENCE_EXPECTILE = 0.8
+#: a lesion ends where the lumen is this share of its reference again; narrower is plaque
+BORDER_SHARE = 0.9
 #: stretches this close to an end (in radii) are left out: the tube ends or widens there.
 END_RADII = 1.5
+#: the lumen at an end is the widest within this, mm
+END_MM = 3.0
 #: a branch needs this many points left to state a stenosis.
 MIN_POINTS = 5
 #: directions at a bifurcation are taken this far from it, mm, at least.
@@ -30,18 +36,35 @@ class BranchLumen:
     Attributes
     ----------
     healthy_mm : (m,) reference diameter at each point; NaN near the ends and in short branches
+    sections : Sections along the branch, of which all figures are taken
+    clear : (sections,) those away from the ends, where a diameter is the branch's own
+    reference_mm : reference diameter at each section, from end to end
     minimal_diameter_mm, minimal_at_mm : minimal lumen diameter and how far from the inlet
-    reference_diameter_mm : healthy diameter there, by a line through the wider parts
+    minimal_sigma_mm : its standard deviation
+    reference_diameter_mm : reference diameter there
     stenosis_percent : 100 (1 - minimal / reference), 0 or more
-    lesion_length_mm : stretch round the minimum narrower than the reference by a quarter
+    area_stenosis_percent : the same of areas
+    lesion_length_mm : distance of the borders; 0 where it is narrower by less than a quarter
+    lesion_mm : proximal and distal border of that lesion, distance from the inlet
+    proximal_reference_mm, distal_reference_mm : reference diameter at the borders
+    plaque_free_mm : length of vessel that is no narrower than its reference by a tenth
     """
 
     healthy_mm: Scalars
+    sections: Sections
+    clear: Array
+    reference_mm: Scalars
     minimal_diameter_mm: float | None = None
     minimal_at_mm: float | None = None
+    minimal_sigma_mm: float | None = None
     reference_diameter_mm: float | None = None
     stenosis_percent: float | None = None
+    area_stenosis_percent: float | None = None
     lesion_length_mm: float | None = None
+    lesion_mm: tuple[float, float] | None = None
+    proximal_reference_mm: float | None = None
+    distal_reference_mm: float | None = None
+    plaque_free_mm: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,55 +77,97 @@ class BifurcationAngle:
     angle_deg: float
 
 
-def branch_lumen(branch: Branch) -> BranchLumen:
-    """Measure one branch; see ``BranchLumen``."""
-    arc, diameter = branch.arc_mm, 2.0 * branch.radius_mm
-    healthy = np.full(len(arc), np.nan)
-    low, high = END_RADII * branch.radius_mm[0], END_RADII * branch.radius_mm[-1]
-    clear = (arc >= low) & (arc <= arc[-1] - high)
-    if np.count_nonzero(clear) < MIN_POINTS:
-        return BranchLumen(healthy_mm=healthy)
-    healthy[clear] = reference_curve(arc[clear], diameter[clear])
-    share = diameter / healthy
-    # The most severe narrowing, not the narrowest point, which may just be the thin far end.
-    k = int(np.nanargmin(share))
-    # One more False, which is the neighbour of both ends.
-    narrow = np.append(share < 1 - LESION_SHARE, False)
-    first, last = k, k
-    if narrow[k]:
-        while narrow[first - 1]:
-            first -= 1
-        while narrow[last + 1]:
-            last += 1
-    return BranchLumen(
-        healthy_mm=healthy,
-        minimal_diameter_mm=float(diameter[k]),
-        minimal_at_mm=float(arc[k]),
-        reference_diameter_mm=float(healthy[k]),
-        stenosis_percent=max(0.0, 100.0 * (1.0 - float(share[k]))),
-        lesion_length_mm=float(arc[last] - arc[first]),
+def tree_lumens(
+    tree: Tree,
+    sections: Sequence[Sections] | None = None,
+    marked: Mapping[int, tuple[float, float]] | None = None,
+) -> tuple[BranchLumen, ...]:
+    """Measure every branch; see ``BranchLumen``.
+
+    Parameters
+    ----------
+    tree : Tree, branches from their inlets
+    sections : of each branch; None takes the tree's own radii
+    marked : branch -> borders of its lesion as the user set them, distance from its inlet, mm
+    """
+    if sections is None:
+        sections = sections_of_radii(tree)
+    clear = [_clear(tree, k, own) for k, own in enumerate(sections)]
+    lines = reference_lines(tree, sections, clear)
+    marked = marked or {}
+    return tuple(
+        _lumen(branch.arc_mm, own, (line, use), marked.get(k))
+        for k, (branch, own, line, use) in enumerate(
+            zip(tree.branches, sections, lines, clear, strict=True)
+        )
     )
 
 
-def reference_curve(arc_mm: Scalars, diameter_mm: Scalars) -> Scalars:
-    """(m,) healthy diameter: a line through the wider parts of a vessel.
+def _clear(tree: Tree, k: int, own: Sections) -> Array:
+    """(m,) sections away from both ends, where the vessel ends or opens into another."""
+    branch, arc, radius = tree.branches[k], own.arc_mm, 0.5 * own.diameter_mm
+    before = [float(b.radius_mm[-1]) for b in tree.branches if b.end == branch.start]
+    # At a blunt end the lumen seems to narrow before it stops.
+    first = max([float(radius[arc <= END_MM].max()), *before])
+    low = END_RADII * first
+    high = END_RADII * float(radius[arc >= arc[-1] - END_MM].max())
+    return own.measured & (arc >= low) & (arc <= arc[-1] - high)
 
-    Asymmetric least squares (expectile regression) with weight ``REFERENCE_EXPECTILE`` above the
-    line. It may rise as well as fall: some vessels widen downstream.
-    """
-    design = np.stack([np.ones(len(arc_mm)), arc_mm - arc_mm.mean()], axis=1)
-    weight = np.ones(len(arc_mm))
-    line = np.full(len(arc_mm), float(np.median(diameter_mm)))
-    for _ in range(20):
-        w = weight[:, None] * design
-        coefficients = np.linalg.lstsq(design.T @ w, w.T @ diameter_mm, rcond=None)[0]
-        line = design @ coefficients
-        new = np.where(diameter_mm > line, REFERENCE_EXPECTILE, 1 - REFERENCE_EXPECTILE)
-        if np.array_equal(new, weight):
-            break
-        weight = new
-    out: Scalars = np.maximum(line, 0.1)
-    return out
+
+def _lumen(
+    arc_mm: Scalars,
+    own: Sections,
+    told: tuple[Scalars, Array],
+    marked: tuple[float, float] | None,
+) -> BranchLumen:
+    line, clear = told
+    searched = clear
+    if marked is not None:
+        line = between_borders(own, line, marked)
+        searched = (own.arc_mm >= marked[0]) & (own.arc_mm <= marked[1])
+        clear = clear | searched
+    healthy = np.full(len(arc_mm), np.nan)
+    if np.count_nonzero(clear) < MIN_POINTS:
+        return BranchLumen(healthy_mm=healthy, sections=own, clear=clear, reference_mm=line)
+    low, high = own.arc_mm[clear][[0, -1]]
+    inner = (arc_mm >= low) & (arc_mm <= high)
+    healthy[inner] = np.interp(arc_mm[inner], own.arc_mm, line)
+    share = own.diameter_mm / line
+    # The most severe narrowing, not the narrowest point, which may just be the thin far end.
+    k = int(np.argmin(np.where(searched, share, np.inf)))
+    least = float(min(share[k], 1.0))
+    first, last = _borders(share, k, least)
+    if marked is not None:
+        first, last = np.flatnonzero(searched)[[0, -1]]
+    spans = np.gradient(own.arc_mm)
+    return BranchLumen(
+        healthy_mm=healthy,
+        sections=own,
+        clear=clear,
+        reference_mm=line,
+        minimal_diameter_mm=float(own.diameter_mm[k]),
+        minimal_at_mm=float(own.arc_mm[k]),
+        minimal_sigma_mm=float(own.sigma_mm[k]) if np.isfinite(own.sigma_mm[k]) else None,
+        reference_diameter_mm=float(line[k]),
+        stenosis_percent=100.0 * (1.0 - least),
+        area_stenosis_percent=100.0 * (1.0 - least**2),
+        lesion_length_mm=float(own.arc_mm[last] - own.arc_mm[first]),
+        lesion_mm=(float(own.arc_mm[first]), float(own.arc_mm[last])) if last > first else None,
+        proximal_reference_mm=float(line[first]) if last > first else None,
+        distal_reference_mm=float(line[last]) if last > first else None,
+        plaque_free_mm=float(spans[clear & (share >= BORDER_SHARE)].sum()),
+    )
+
+
+def _borders(share: Scalars, k: int, least: float) -> tuple[int, int]:
+    """Sections at which the lesion round section ``k`` begins and ends."""
+    first = last = k
+    if least < 1 - LESION_SHARE:
+        while first > 0 and share[first] < BORDER_SHARE:
+            first -= 1
+        while last < len(share) - 1 and share[last] < BORDER_SHARE:
+            last += 1
+    return first, last
 
 
 def bifurcation_angles(tree: Tree) -> tuple[BifurcationAngle, ...]:

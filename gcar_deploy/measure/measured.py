@@ -8,16 +8,20 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gcar_deploy.config import LesionBorders
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.measure.bifurcation import Bifurcation, bifurcations
+from gcar_deploy.measure.borders import marked_lesions
 from gcar_deploy.measure.further_view import FurtherView, best_further_view
 from gcar_deploy.measure.lumen import (
     BifurcationAngle,
     BranchLumen,
     bifurcation_angles,
-    branch_lumen,
     foreshortening,
+    tree_lumens,
 )
 from gcar_deploy.measure.naming import BranchName, read_anatomy
+from gcar_deploy.measure.sections import Sections, sections_of_radii
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Points, Scalars
 
@@ -30,6 +34,8 @@ class Measured:
     ----------
     names : per branch its name (LM, LAD, LCx, RCA) with its probability, or None
     lumens : per branch its diameters, measured from its inlet
+    bifurcations : where one branch becomes two, each with its three segments
+    unplaced : a sentence for each lesion the user marked where no branch runs
     angles : between each two branches that meet
     hidden : (branches, views) share of a branch's length that a view hides, 0 .. 1
     residual_mm : (views, n) distance of each point of ``tree.points()`` from the view's vessels
@@ -39,30 +45,44 @@ class Measured:
 
     names: tuple[BranchName | None, ...]
     lumens: tuple[BranchLumen, ...]
+    bifurcations: tuple[Bifurcation, ...]
+    unplaced: tuple[str, ...]
     angles: tuple[BifurcationAngle, ...]
     hidden: Array
     residual_mm: Array
     further: FurtherView | None
 
 
-def measured(tree: Tree, views: Sequence[VesselImage]) -> Measured:
+def measured(
+    tree: Tree,
+    views: Sequence[VesselImage],
+    sections: Sequence[Sections] | None = None,
+    marks: Sequence[LesionBorders] = (),
+) -> Measured:
     """Measure a tree.
 
     Parameters
     ----------
     tree : Tree, mm LPS, branches from their inlets (``measure.inlet``)
     views : one or more, with the geometry that was used
+    sections : of each branch (``measure.sections``); None takes the tree's own radii
+    marks : lesion borders that the user set in the pictures
     """
-    points = tree.points()
+    points, carms = tree.points(), [view.carm for view in views]
+    sections = sections_of_radii(tree) if sections is None else sections
+    marked, unplaced = marked_lesions(tree, sections, carms, marks)
+    lumens = tree_lumens(tree, sections, marked)
     return Measured(
         names=read_anatomy(tree).names,
-        lumens=tuple(branch_lumen(branch) for branch in tree.branches),
+        lumens=lumens,
+        bifurcations=bifurcations(tree, lumens),
+        unplaced=unplaced,
         angles=bifurcation_angles(tree),
         hidden=np.array(
             [[foreshortening(branch, view.carm) for view in views] for branch in tree.branches]
         ).reshape(-1, len(views)),
         residual_mm=np.stack([residuals(points, view) for view in views]),
-        further=best_further_view(tree, [view.carm for view in views]),
+        further=best_further_view(tree, carms),
     )
 
 

@@ -6,10 +6,17 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions, check_options
+from gcar_deploy.config import (
+    PREDICTORS,
+    REFINERS,
+    SEGMENTERS,
+    LesionBorders,
+    RunOptions,
+    check_options,
+)
 from gcar_deploy.errors import UsageError
 from gcar_deploy.inputs.drawn import DOES, Stroke
 from gcar_deploy.inputs.order import (
@@ -44,8 +51,11 @@ def orders(draw) -> Order:
     landmark = st.tuples(*[_points] * len(views))
     pose = draw(st.none() | st.sampled_from(POSES))
     landmarks = st.lists(landmark, min_size=1, max_size=3).map(tuple)
+    mark = st.tuples(st.floats(0, 4000), st.floats(0, 4000))
+    lesions = st.builds(LesionBorders, view=numbers, proximal=mark, distal=mark)
     return Order(
         views=views,
+        lesions=draw(st.none() | st.lists(lesions, min_size=1, max_size=2).map(tuple)),
         geometry=draw(st.none() | _names | st.just({"schema": "gcar-geometry/1", "views": []})),
         masks=draw(st.dictionaries(numbers, _names, max_size=3)),
         landmarks=None if pose == "off" else draw(st.none() | landmarks),
@@ -70,6 +80,7 @@ def orders(draw) -> Order:
     )
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(orders())
 def test_json_and_back(order):
     text = order_to_json(order)
@@ -78,6 +89,7 @@ def test_json_and_back(order):
     assert order.with_files(lambda _, path: path) == order
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(orders())
 def test_every_order_makes_options_that_pass_their_checks(order):
     options = order.options(RunOptions())
@@ -95,6 +107,7 @@ def test_every_order_makes_options_that_pass_their_checks(order):
         ("same_branch", options.same_branch),
         ("ostia", options.ostia),
         ("deleted_mm", options.deleted_mm),
+        ("lesions", options.lesions),
     ):
         if getattr(order, key) is not None:
             assert told == getattr(order, key), key
@@ -146,6 +159,9 @@ BASE = {"views": ["a", "b"]}
         ({"ostia": [[[1, 2, 3], None]]}, "ostia: [1, 2, 3] must be [column, row]"),
         ({"deleted_mm": [[1, 2]]}, "deleted_mm = [1, 2] must be 3 numbers"),
         ({"deleted_mm": [[1, 2, 1e6]]}, "outside -2000 .. 2000 mm"),
+        ({"lesions": [{"view": 3, "proximal": [1, 2], "distal": [3, 4]}]}, "lesions.view = 3"),
+        ({"lesions": [{"view": 1, "proximal": [1, 2]}]}, "has no distal"),
+        ({"lesions": [{"view": 1, "proximal": [1], "distal": [3, 4]}]}, "column, row"),
         ({"frames": [0]}, "frames = 0"),
         ({"frames": 7}, "list of frames"),
         ({"frames": [1.5]}, "whole number"),

@@ -4,11 +4,15 @@ import pytest
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.measure.lumen import (
     bifurcation_angles,
-    branch_lumen,
     foreshortening,
+    tree_lumens,
 )
 from gcar_deploy.tree.tree import Tree
 from tests.tree.shapes import branch, fork, tube
+
+
+def lumen_of(points, radius):
+    return tree_lumens(Tree(nodes_mm=points[[0, -1]], branches=(branch(points, radius, 0, 1),)))[0]
 
 
 @pytest.mark.parametrize("severity", [0.3, 0.5, 0.7])
@@ -17,7 +21,7 @@ def test_percent_stenosis_of_a_made_narrowing(severity):
     healthy = 1.6 - 0.008 * z
     radius = healthy * (1 - severity * np.exp(-0.5 * ((z - 30) / 3) ** 2))
     points = np.stack([0 * z, 0 * z, z], 1)
-    out = branch_lumen(branch(points, radius))
+    out = lumen_of(points, radius)
     assert out.stenosis_percent == pytest.approx(100 * severity, abs=4)
     assert out.minimal_at_mm == pytest.approx(30, abs=1)
     assert out.minimal_diameter_mm == pytest.approx(2 * radius.min(), abs=0.02)
@@ -26,13 +30,13 @@ def test_percent_stenosis_of_a_made_narrowing(severity):
 
 def test_healthy_taper_is_no_stenosis():
     z = np.linspace(0, 60, 121)
-    out = branch_lumen(branch(np.stack([0 * z, 0 * z, z], 1), 2.0 - 0.02 * z))
+    out = lumen_of(np.stack([0 * z, 0 * z, z], 1), 2.0 - 0.02 * z)
     assert out.stenosis_percent < 3
     assert out.lesion_length_mm == 0
 
 
 def test_a_short_branch_states_no_stenosis():
-    out = branch_lumen(tube(length=4, radius=1.5, count=5).branches[0])
+    out = tree_lumens(tube(length=4, radius=1.5, count=5))[0]
 
     assert out.stenosis_percent is None
 

@@ -12,7 +12,7 @@ from gcar_deploy.quality.ghosts import Ghosts, ProbableGhost
 def with_tree(result, tree):
     """Another tree, of whose ghosts nothing is known."""
     quality = dataclasses.replace(result.quality, ghosts=None, exchanges=())
-    return dataclasses.replace(result, tree=tree, quality=quality)
+    return dataclasses.replace(result, tree=tree, sections=None, quality=quality)
 
 
 def with_ghost(result):

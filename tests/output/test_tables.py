@@ -208,7 +208,7 @@ def test_lumen_figures_are_in_the_summary_and_in_the_vtp(result, tmp_path):
     assert row["minimal_diameter_mm"] == pytest.approx(1.5, abs=1e-6)
     assert row["minimal_at_mm"] == pytest.approx(20.0)
     assert row["stenosis_percent"] == pytest.approx(50.0, abs=2.0)
-    assert row["lesion_length_mm"] == pytest.approx(2 * 2.5 * np.sqrt(2 * np.log(2)), abs=1.0)
+    assert row["lesion_length_mm"] == pytest.approx(2 * 2.5 * np.sqrt(2 * np.log(5)), abs=1.0)
     file = tmp_path / "line.vtp"
     file.write_bytes(centerline_vtp(tree, narrowed.measured, narrowed.ghost_probability))
     reader = vtk.vtkXMLPolyDataReader()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.config import TubeOptions
-from gcar_deploy.measure.lumen import branch_lumen
+from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import footprints
@@ -67,8 +67,7 @@ def test_noise_makes_no_lesion():
     healthy = np.linspace(1.6, 1.2, len(LINE))
     found = refitted(tube(healthy), views_of(tube(healthy), noise_mm=0.3))
     assert np.abs(found / healthy - 1).max() < 0.1
-    (vessel,) = tube(found).branches
-    assert branch_lumen(vessel).stenosis_percent < 10
+    assert tree_lumens(tube(found))[0].stenosis_percent < 10
 
 
 def test_nothing_is_guessed_where_the_contrast_is_unknown():

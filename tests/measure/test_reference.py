@@ -1,0 +1,101 @@
+"""References of trees whose healthy calibre is known; borders and bifurcations."""
+
+import numpy as np
+import pytest
+
+from gcar_deploy.config import LesionBorders
+from gcar_deploy.measure.bifurcation import bifurcations
+from gcar_deploy.measure.borders import marked_lesions
+from gcar_deploy.measure.lumen import tree_lumens
+from gcar_deploy.measure.reference import FLOW_EXPONENT
+from gcar_deploy.measure.sections import sections_of_radii
+from gcar_deploy.tree.tree import Tree
+from tests.tree.shapes import branch
+from tests.tubes.scenes import two_views
+
+Q = FLOW_EXPONENT
+
+
+def bifurcated(parent_length=30.0, narrow=None):
+    """A trunk of 3.6 mm with daughters of 3.0 mm and what the flow law leaves."""
+    side = (3.6**Q - 3.0**Q) ** (1 / Q)
+    z = np.arange(0, parent_length + 0.1, 0.5)
+    s = np.arange(0, 35.1, 0.5)
+    trunk = np.stack([0 * z, 0 * z, z - z[-1]], 1)
+    lines = (trunk, np.stack([0.5 * s, 0 * s, s], 1), np.stack([0 * s, -0.7 * s, 0.7 * s], 1))
+    radii = [np.full(len(line), d / 2) for line, d in zip(lines, (3.6, 3.0, side), strict=True)]
+    if narrow is not None:
+        k, middle, length, share = narrow
+        arc = np.linalg.norm(lines[k] - lines[k][0], axis=1)
+        off = np.clip(2 * np.abs(arc - middle) / length, 0, 1)
+        radii[k] = radii[k] * (1 - share * 0.5 * (1 + np.cos(np.pi * off)))
+    nodes = np.array([trunk[0], np.zeros(3), lines[1][-1], lines[2][-1]])
+    ends = ((0, 1), (1, 2), (1, 3))
+    made = tuple(branch(p, r, *e) for p, r, e in zip(lines, radii, ends, strict=True))
+    return Tree(nodes_mm=nodes, branches=made)
+
+
+def test_healthy_calibres_with_their_step():
+    lumens = tree_lumens(bifurcated())
+    found = [float(np.median(lumen.reference_mm)) for lumen in lumens]
+    assert found == pytest.approx([3.6, 3.0, (3.6**Q - 3.0**Q) ** (1 / Q)], rel=0.01)
+    assert all(lumen.stenosis_percent < 2 and lumen.lesion_mm is None for lumen in lumens)
+
+
+def test_a_short_trunk_narrow_nearly_all_along_has_its_reference_from_its_neighbours():
+    (trunk, *_) = tree_lumens(bifurcated(14.0, narrow=(0, 7.0, 10.0, 0.5)))
+    assert trunk.reference_diameter_mm == pytest.approx(3.6, abs=0.35)
+    assert trunk.stenosis_percent == pytest.approx(50, abs=7)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_lesion_borders_and_areas(share):
+    _, main, _ = tree_lumens(bifurcated(narrow=(1, 20.0, 12.0, share)))
+    assert main.stenosis_percent == pytest.approx(100 * share, abs=2)
+    assert main.area_stenosis_percent == pytest.approx(100 * (1 - (1 - share) ** 2), abs=3)
+    first, last = main.lesion_mm
+    # Where the raised cosine has come back to nine tenths.
+    half = 6.0 / np.pi * np.arccos(2 * 0.1 / share - 1)
+    assert (first, last) == pytest.approx((20 - half, 20 + half), abs=1.2)
+    assert main.lesion_length_mm == pytest.approx(last - first)
+    assert main.proximal_reference_mm == pytest.approx(3.0, abs=0.06)
+    assert main.distal_reference_mm == pytest.approx(3.0, abs=0.06)
+    clear = main.sections.arc_mm[main.clear]
+    expected = clear[-1] - clear[0] - (last - first)
+    assert main.plaque_free_mm == pytest.approx(expected, abs=1.5)
+
+
+def test_three_segments_meet_at_a_bifurcation():
+    tree = bifurcated(narrow=(2, 7.0, 6.0, 0.6))
+    (node,) = bifurcations(tree, tree_lumens(tree))
+    assert [(s.branch, s.role) for s in node.segments] == [(0, "parent"), (1, "main"), (2, "side")]
+    assert node.segments[2].stenosis_percent == pytest.approx(60, abs=4)
+    assert max(s.stenosis_percent for s in node.segments[:2]) < 3
+    side = (3.6**Q - 3.0**Q) ** (1 / Q)
+    assert node.calibre_ratio == pytest.approx(3.6 / (3.0 + side), rel=0.02)
+
+
+def test_the_users_borders_win():
+    tree = bifurcated(narrow=(1, 20.0, 8.0, 0.5))
+    carms, sections = two_views(), sections_of_radii(tree)
+    line = tree.branches[1]
+    ends = [line.points_mm[np.argmin(np.abs(line.arc_mm - at))] for at in (18.0, 22.0)]
+    proximal, distal = (tuple(carms[1].project(e[None])[0][0].tolist()) for e in ends)
+    mark = LesionBorders(view=2, proximal=proximal, distal=distal)
+    marked, missed = marked_lesions(tree, sections, carms, (mark,))
+    assert missed == () and list(marked) == [1]
+    assert marked[1] == pytest.approx((18, 22), abs=0.6)
+    found = tree_lumens(tree, sections, marked)[1]
+    assert found.lesion_mm == pytest.approx((18, 22), abs=0.6)
+    # Set within the lesion, borders have a reference that is narrowed itself.
+    assert found.reference_diameter_mm < 2.9
+    assert found.stenosis_percent < 47
+    free = tree_lumens(tree, sections)[1]
+    assert free.reference_diameter_mm == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_mark_beside_every_vessel_is_said():
+    tree = bifurcated()
+    mark = LesionBorders(view=1, proximal=(2.0, 2.0), distal=(4.0, 2.0))
+    marked, missed = marked_lesions(tree, sections_of_radii(tree), two_views(), (mark,))
+    assert not marked and "lesion 1: no branch passes" in missed[0]
