@@ -249,18 +249,45 @@ def tree_table(data: Path | None, count: int) -> None:
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
 )
 @click.option("--count", default=30, show_default=True, help="Cases, one stenosis each.")
-def lumen_table(data: Path | None, count: int) -> None:
+@click.option(
+    "--vessels",
+    default=0,
+    show_default=True,
+    help="Single vessels of known area, of each kind of picture.",
+)
+@click.option("--healthy", default=0, show_default=True, help="Generated trees without a lesion.")
+def lumen_table(data: Path | None, count: int, vessels: int, healthy: int) -> None:
     """Measure stenosis, radius and branch lengths on trees with one known stenosis.
 
     Left trees, the clinical views, stenoses of 30 .. 70 % of the diameter, 8 .. 16 mm long.
+    With --vessels: round, oval and (with DATA/ivus) real lumens along centrelines of DATA/imagecas
+    or generated ones; healthy diameters of 1.2 .. 4 mm, stenoses of 30 .. 90 %, pixels of
+    0.15 .. 0.4 mm, blur of 0.3 .. 0.6 mm (full width at half maximum), noise up to 0.1 mm.
+    With --healthy: how many lesions of 25 % and more are seen where there is none.
 
-    Example: gcar-export lumen-table --data data --count 27
+    Example: gcar-export lumen-table --data data --count 27 --vessels 24 --healthy 8
     """
     from gcar_export.studies.lumen_table import lumen_rows, table
+    from gcar_export.studies.lumen_vessel_table import (
+        KINDS,
+        false_lesions,
+        vessel_rows,
+        vessel_table,
+    )
 
     with click.progressbar(length=count, label="cases", file=sys.stderr) as bar:
         rows = lumen_rows(data, count, lambda: bar.update(1))
     click.echo(table(rows))
+    if vessels:
+        with click.progressbar(
+            length=vessels * len(KINDS), label="vessels", file=sys.stderr
+        ) as bar:
+            made = vessel_rows(data, vessels, lambda: bar.update(1))
+        click.echo("\n" + vessel_table(made))
+    if healthy:
+        with click.progressbar(length=healthy, label="healthy", file=sys.stderr) as bar:
+            seen, stated = false_lesions(healthy, lambda: bar.update(1))
+        click.echo(f"\nLesions of 25 % and more where there is none: {seen} in {stated} vessels")
 
 
 # Verbs with files of their own.

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
-from gcar_deploy.measure.lumen import branch_lumen
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
+from gcar_deploy.tree.tree import Tree, along
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
     Tube,
@@ -100,11 +100,16 @@ def measure_case(engine: Engine, case: StenosisCase) -> LumenRow:
         result = engine.reconstruct(angiograms, grid)
     except GcarError:
         return LumenRow(name=case.name, status="refused", percent=case.lesion.percent)
-    return compare(case, result.tree, result.status)
+    return compare(case, result.tree, result.status, result.measured.lumens)
 
 
-def compare(case: StenosisCase, tree: Tree, status: str = "ok") -> LumenRow:
-    """Measure a tree against the case that it should be."""
+def compare(
+    case: StenosisCase,
+    tree: Tree,
+    status: str = "ok",
+    lumens: Sequence[BranchLumen] | None = None,
+) -> LumenRow:
+    """Measure a tree against the case that it should be; without ``lumens`` by its own radii."""
     points, radii, graph = tree.points(), tree.radii(), point_graph(tree)
     lookup = cKDTree(points)
     errors, lengths, branches, found = [], [], 0, 0
@@ -118,7 +123,7 @@ def compare(case: StenosisCase, tree: Tree, status: str = "ok") -> LumenRow:
         if matched.mean() >= FOUND_SHARE:
             found += 1
             lengths.append(_length_error(vessel, matched, at, graph))
-    mld, percent = _lesion(case, tree)
+    mld, percent = _lesion(case, tree, tree_lumens(tree) if lumens is None else lumens)
     return LumenRow(
         name=case.name,
         status=status,
@@ -163,26 +168,28 @@ def _length_error(
     return float(reach[at[which[-1]]] - true)
 
 
-def _lesion(case: StenosisCase, tree: Tree) -> tuple[float | None, float | None]:
+def _lesion(
+    case: StenosisCase, tree: Tree, lumens: Sequence[BranchLumen]
+) -> tuple[float | None, float | None]:
     """Minimal diameter and % stenosis of the reconstruction within the true lesion."""
     vessel, lesion = case.vessels[case.lesion.vessel], case.lesion
     arc, lookup = vessel.arc_mm, cKDTree(vessel.points_mm)
     least, percent = None, None
-    for branch in tree.branches:
-        gap, nearest = lookup.query(branch.points_mm)
+    for branch, lumen in zip(tree.branches, lumens, strict=True):
+        own = lumen.sections
+        gap, nearest = lookup.query(along(branch.points_mm, branch.arc_mm, own.arc_mm))
         inside = (gap <= NEAR_MM) & (
             np.abs(arc[nearest] - lesion.middle_mm) <= lesion.length_mm / 2
         )
         if not inside.any():
             continue
-        diameter = np.where(inside, 2 * branch.radius_mm, np.inf)
+        diameter = np.where(inside, own.diameter_mm, np.inf)
         k = int(np.argmin(diameter))
         if least is not None and diameter[k] >= least:
             continue
         least, percent = float(diameter[k]), None
-        healthy = float(branch_lumen(branch).healthy_mm[k])
-        if np.isfinite(healthy):
-            percent = 100 * (1 - least / healthy)
+        if lumen.clear[k]:
+            percent = 100 * (1 - least / float(lumen.reference_mm[k]))
     return least, percent
 
 
