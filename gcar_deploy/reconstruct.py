@@ -152,7 +152,7 @@ def _reconstructed(
         losses=refined.losses, predictor=centers.points.source, refiner=refined.refiner,
         model=None if predictor is None else predictor.model.label,
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
-        notes=(), options=options, ending=refined.ending,
+        notes=(), options=options, ending=refined.ending, close_calls=refined.close_calls,
     )  # fmt: skip
 
 

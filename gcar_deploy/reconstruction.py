@@ -31,7 +31,7 @@ from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
 from gcar_deploy.quality import Quality, part_lengths_mm, unexplained
 from gcar_deploy.tree.tree import Branch, Tree, along
-from gcar_deploy.tubes import Ending
+from gcar_deploy.tubes import CloseCall, Ending
 from gcar_deploy.types import Mask, Scalars, Volume
 
 SCHEMA = "gcar-result/1"
@@ -70,6 +70,7 @@ class Reconstruction:
     notes : sentences for the user that do not lower the status
     options : RunOptions
     ending : how the fit of the tubes ended, None where none were fitted
+    close_calls : pieces of vessel that were kept or dropped by a hair
     """
 
     quality: Quality
@@ -91,6 +92,7 @@ class Reconstruction:
     notes: tuple[str, ...]
     options: RunOptions
     ending: Ending | None = None
+    close_calls: tuple[CloseCall, ...] = ()
 
     @property
     def status(self) -> str:
@@ -167,6 +169,10 @@ class Reconstruction:
             tree=self.tree.moved(frame.origin_mm),
             gaussians=dataclasses.replace(self.gaussians, means_mm=means),
             grid=grid, angiograms=tuple(angiograms), views=views, poses=poses, options=options,
+            close_calls=tuple(
+                dataclasses.replace(call, middle_mm=call.middle_mm + frame.origin_mm)
+                for call in self.close_calls
+            ),
         )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -272,6 +278,7 @@ class Reconstruction:
                 }
                 for pair in self.quality.exchanges
             ],
+            "close_calls": [dataclasses.asdict(call) for call in self.close_calls],
         }
 
     def _place(self, branch: int, at_mm: float) -> list[float]:

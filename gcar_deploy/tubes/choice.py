@@ -26,7 +26,7 @@ from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
 from gcar_deploy.tubes.support import least_seen
 from gcar_deploy.tubes.targets import Target
-from gcar_deploy.types import Array, Scalars
+from gcar_deploy.types import Array, Points, Scalars
 
 #: branches are judged in pieces of at most this length, mm
 PIECE_MM = 100.0
@@ -43,6 +43,8 @@ PIECE_GROWTH = 2.5
 #: a piece is kept from this share on; a dropped one comes back where every view misses at least
 #: ``MISSED_SHARE`` of it
 MIN_SHARE, MISSED_SHARE = 0.5, 0.45
+#: a share this near to ``MIN_SHARE`` is a near-tie: told, since small errors decide it
+TIE = 0.05
 #: least sine between vessel and ray when a path is turned into a radius.
 MIN_SINE = 0.35
 #: radii believed when a piece stands alone, mm.
@@ -58,12 +60,42 @@ class Pieces:
     segment : (s,) piece of each segment
     length_mm, confidence : (k,)
     share : (k,) 0 .. 1, how much of it the pictures want
+    tie : (k,) whether that was a near-tie
     """
 
     segment: Array
     length_mm: Scalars
     confidence: Scalars
     share: Scalars
+    tie: Array
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CloseCall:
+    """A piece of vessel that was kept or dropped by a hair.
+
+    Attributes
+    ----------
+    middle_mm : (3,) its middle, mm LPS
+    length_mm : float
+    kept : bool
+    """
+
+    middle_mm: Points
+    length_mm: float
+    kept: bool
+
+
+def close_calls(tree: Tree, pieces: Pieces) -> tuple[CloseCall, ...]:
+    """Return the near-ties among the pieces of a tree, in the order of its branches."""
+    tubes = tubes_of(tree)
+    out = []
+    for k in np.flatnonzero(pieces.tie):
+        own = np.flatnonzero(pieces.segment == k)
+        middle = tubes.points_mm[tubes.first[own[len(own) // 2]]]
+        kept = bool(pieces.share[k] >= MIN_SHARE)
+        out.append(CloseCall(middle_mm=middle, length_mm=float(pieces.length_mm[k]), kept=kept))
+    return tuple(out)
 
 
 def kept_tree(tree: Tree, pieces: Pieces) -> Tree:
@@ -128,14 +160,16 @@ def weigh_pieces(
     gram, pull = _normal(alone, segment, count, targets)
     cost = PIECE_COST * total * (FAIR_CONFIDENCE - confidence)
     share = _solve(gram, pull - cost, confidence)
+    tie = np.abs(share - MIN_SHARE) < TIE
     kept = share >= MIN_SHARE
     if kept.any():
         # The level of confidence depends on the predictor; ghosts stand out below its usual.
         usual = _weighted_median(confidence[kept], total[kept])
-        share = np.where(confidence >= TRUSTED_SHARE * usual, 1.0, share)
+        trusted = confidence >= TRUSTED_SHARE * usual
+        share, tie = np.where(trusted, 1.0, share), tie & ~trusted
     if not all(target.calibrated for target in targets):
         share = wanted_parts((share - MIN_SHARE) * total, joints, PART_MM).astype(np.float64)
-    return Pieces(segment, total, confidence, share)
+    return Pieces(segment, total, confidence, share, tie)
 
 
 def wanted_parts(gain: Scalars, joints: Array, part_cost: float) -> Array:

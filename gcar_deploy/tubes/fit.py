@@ -13,7 +13,13 @@ from gcar_deploy.geometry.covariance import worst_sigma
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes.choice import kept_tree, reinstated, weigh_pieces
+from gcar_deploy.tubes.choice import (
+    CloseCall,
+    close_calls,
+    kept_tree,
+    reinstated,
+    weigh_pieces,
+)
 from gcar_deploy.tubes.gauss_newton import (
     Progress,
     fit_level,
@@ -44,6 +50,7 @@ class TubeFit:
     progress : Progress
     model_mm : per view (rows, cols) path of the tubes at the picture's own pixels; empty where
         the fit ended before that level
+    close_calls : pieces that were kept or dropped by a hair
     """
 
     tree: Tree
@@ -52,6 +59,7 @@ class TubeFit:
     contrast: tuple[float, ...]
     progress: Progress
     model_mm: tuple[Array, ...] = ()
+    close_calls: tuple[CloseCall, ...] = ()
 
 
 def fit_tubes(
@@ -133,7 +141,8 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
         if number or len(options.levels_mm) == 1:
             continue
         if len(targets) > 1:
-            now = _chosen(now, start_radius, targets, run)
+            now, calls = _chosen(now, start_radius, targets, run)
+            start = dataclasses.replace(start, close_calls=calls)
         if now.tree.branches:
             now = run.fit(_supported(now, targets), targets, steps // 2)
         if not now.tree.branches:
@@ -186,7 +195,9 @@ def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
     ]
 
 
-def _chosen(now: _State, start_radius: Scalars, targets: list[Target], run: _Run) -> _State:
+def _chosen(
+    now: _State, start_radius: Scalars, targets: list[Target], run: _Run
+) -> tuple[_State, tuple[CloseCall, ...]]:
     """Drop ghosts, fit the rest, and take back what every view then misses."""
     options, tree = run.options, now.tree
     targets = rescaled(targets, now.prints)
@@ -196,9 +207,9 @@ def _chosen(now: _State, start_radius: Scalars, targets: list[Target], run: _Run
     prints = kept.prints or footprints(kept.tubes, targets)
     left = unexplained(targets, prints)
     back = reinstated(tree, pieces, start_radius, targets, left)
-    if np.array_equal(back.share, pieces.share):
-        return kept
-    return run.fit(kept_tree(tree, back), targets, steps)
+    if not np.array_equal(back.share, pieces.share):
+        kept = run.fit(kept_tree(tree, back), targets, steps)
+    return kept, close_calls(tree, back)
 
 
 def _supported(now: _State, targets: list[Target]) -> Tree:

@@ -21,6 +21,7 @@ from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.edit import without_branch_at
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes.choice import CloseCall
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import Ending
 from gcar_deploy.tubes.gaussians import gaussians_on_tree
@@ -58,6 +59,7 @@ class Refined:
     centers : CenterPoints the refinement started from
     model_mm : per view (rows, cols) path of the fitted tubes, mm; empty where not at hand
     ending : how the fit ended, None where no tubes were fitted
+    close_calls : pieces of vessel that were kept or dropped by a hair
     """
 
     refiner: str
@@ -71,6 +73,7 @@ class Refined:
     centers: CenterPoints
     model_mm: tuple[Array, ...] = ()
     ending: Ending | None = None
+    close_calls: tuple[CloseCall, ...] = ()
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -173,6 +176,7 @@ def refine(
         centers=centers,
         model_mm=fit.model_mm,
         ending=fit.progress.ending,
+        close_calls=fit.close_calls,
     )
 
 

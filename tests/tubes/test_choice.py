@@ -102,3 +102,22 @@ def test_a_faint_piece_stays_where_paths_are_estimates_and_others_hang_on_it(
     targets = make_targets(seen(tree, two_views(), calibrated), 0.0, TubeOptions())
     pieces = choice.weigh_pieces(tree, tubes, tree.radii(), targets)
     assert np.count_nonzero(pieces.share < choice.MIN_SHARE) == lost
+
+
+def test_near_ties_are_told_whichever_way_they_fell(monkeypatch):
+    tree = fork()
+    tubes = tubes_of(tree)
+    monkeypatch.setattr(choice, "PIECE_MM", 1e3)
+    monkeypatch.setattr(choice, "TRUSTED_SHARE", 9.0)
+    monkeypatch.setattr(choice, "_solve", lambda *_: np.array([0.9, 0.52, 0.48]))
+    targets = make_targets(seen(tree, two_views(), True), 0.0, TubeOptions())
+    pieces = choice.weigh_pieces(tree, tubes, tree.radii(), targets)
+    assert pieces.tie.tolist() == [False, True, True]
+    calls = choice.close_calls(tree, pieces)
+    assert [call.kept for call in calls] == [True, False]
+    for call, branch in zip(calls, tree.branches[1:], strict=True):
+        assert call.length_mm == pytest.approx(branch.length_mm)
+        gap = np.linalg.norm(branch.points_mm - call.middle_mm, axis=1)
+        assert abs(branch.arc_mm[gap.argmin()] - 0.5 * branch.length_mm) < 2.0
+    monkeypatch.setattr(choice, "TRUSTED_SHARE", 0.0)  # what is trusted is no tie
+    assert not choice.weigh_pieces(tree, tubes, tree.radii(), targets).tie.any()
