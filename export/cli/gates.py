@@ -142,3 +142,34 @@ def ghost_fit(
     _say(tables, out / "ghosts.md")
     study.draw(model, groups, out / "ghosts.png")
     click.echo(out / "ghosts.png")
+
+
+@click.command("status-table")
+@click.option("--trees", default=12, show_default=True, help="Generated trees per seed.")
+@click.option("--seed", default=50_001, show_default=True, help="Population of the rule.")
+@click.option("--check-seed", default=50_002, show_default=True, help="Population to check on.")
+@_shared
+def status_table(
+    trees: int, seed: int, check_seed: int, data: Path | None, cases: str, out: Path
+) -> None:
+    """Tell how statuses and truth go together, and the ROC of the score underneath.
+
+    Goes on where an earlier run, also of gate-table, with the same --out stopped.
+
+    Example: gcar-export status-table --data data --out gates
+    """
+    from gcar_deploy.config import QualityOptions
+    from gcar_export.studies import status_table as study
+    from gcar_export.studies.gate_pairs import WRONG
+
+    gates = QualityOptions()
+    seeds = ((seed, trees), (check_seed, trees))
+    first, second, real = _measured(out, seeds, _labels(data, cases), ["same", *WRONG])
+    groups = {f"seed {seed}": first, f"seed {check_seed}": second} | (
+        {"real": real} if real else {}
+    )
+    chosen = study.chosen_share(first, gates)
+    rule = f"good_ghost_share: {gates.good_ghost_share:g}; by the rule on seed {seed}: {chosen:g}"
+    _say([study.truth_table(groups, gates), rule], out / "status.md")
+    study.draw(groups, gates, out / "status.png")
+    click.echo(out / "status.png")

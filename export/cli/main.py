@@ -11,7 +11,7 @@ import click
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli.centers import centers_table, robustness
 from gcar_export.cli.evaluate import converge, evaluate
-from gcar_export.cli.gates import gate_table, ghost_fit
+from gcar_export.cli.gates import gate_table, ghost_fit, status_table
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table
 from gcar_export.cli.wrong_scenes import wrong_scenes
 
@@ -303,6 +303,7 @@ for _verb in (
     gate_table,
     wrong_scenes,
     ghost_fit,
+    status_table,
 ):
     main.add_command(_verb)
 

@@ -23,10 +23,11 @@ from gcar_deploy.types import Array, Scalars
 from gcar_export.studies.gate_pairs import PICTURES
 from gcar_export.studies.gate_rows import Row
 
-#: pull of the weights towards 0: as one observation of 8 mm with unit curvature each
+#: pull of each weight towards 0, observations
 PULL = 1.0
-#: length that counts as one observation, mm: neighbours share their fate
-OBSERVED_MM = 8.0
+#: length that counts as one observation, mm: whole trees share their fate more than stretches do.
+#: Of 8 to 1000 mm this states best what trees that are left out of the fit turn out to be
+OBSERVED_MM = 400.0
 #: edges of the classes of the reliability table
 CLASSES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 

@@ -40,9 +40,9 @@ class QualityOptions:
     #: above this raw pictures are never ``ok``: two real trees were at 0.149. From 0.12 on it takes
     #: ``ok`` from no pair of one tree
     sure_disagreement_raw: Gate = 0.12
-    #: the same of masks, which show the wider of two vessels that overlap: up to 0.28 between views
-    #: of one tree. Chosen on masks by the rule of ``gcar-export gate-table``
-    good_disagreement_mask: Gate = 0.3
+    #: the same of masks, which show the wider of two vessels that overlap: 0.07 to 0.28 between
+    #: views of one tree. By the rule of ``gcar-export gate-table``
+    good_disagreement_mask: Gate = 0.25
     max_disagreement_mask: Gate = 0.6
     #: above this the largest part of each picture is asked alone: what else was found may be
     #: background. 0.1 to 0.28 would cost a little less on the first seed
@@ -51,6 +51,7 @@ class QualityOptions:
     #: disagreement: nobody can say that they are not swapped. Without it 5, 7 and 1 swapped raw
     #: pairs of 24, 24 and 10 would be ``ok``; it takes ``ok`` from 0, 0 and 1 pairs of one tree
     order_ratio: Annotated[float, Range(0, 1e3)] = 1.2
+    #: the same of masks: right pairs agree as well the other way round more often than raw ones
     order_ratio_mask: Annotated[float, Range(0, 1e3)] = 1.0
     #: below this (and ``good_disagreement``) people are asked whether they swapped them: all
     #: swapped path lengths, 33 of 58 swapped raw pairs, one of 540 others
@@ -72,8 +73,9 @@ class QualityOptions:
     #: lattice cell is not an error
     near_px: Length = 2.0
     near_mm: Length = 1.0
-    #: share of a tree's length that is to be expected in ghosts (``quality.ghosts``)
-    good_ghost_share: Share = 0.1
+    #: share of a tree's length that is to be expected in ghosts; by the rule of ``gcar-export
+    #: status-table``, which tells what it costs
+    good_ghost_share: Share = 0.125
     #: a larger estimated correction between the runs is no small matter of breath or table
     good_shift_mm: Length = 5.0
     good_turn_deg: Length = 1.5

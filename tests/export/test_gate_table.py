@@ -15,23 +15,23 @@ from gcar_export.scenes.labels import read_label
 from gcar_export.scenes.protocols import case_geometry, make_case
 from gcar_export.studies.gate_pairs import (
     KINDS,
+    MASKS,
     PICTURES,
     generated_subject,
     make_pair,
     real_subject,
+    side_of,
 )
 from gcar_export.studies.gate_report import doubt_table, draw, gate_table, level_table, status_table
-from gcar_export.studies.gate_table import (
+from gcar_export.studies.gate_rows import (
     Attempt,
     Row,
-    choose,
-    cost,
     examined,
     measure,
     open_engines,
     read_rows,
-    replayed,
 )
+from gcar_export.studies.gate_table import choose, cost, replayed
 from tests.conftest import data_dir
 
 GATES = QualityOptions()
@@ -41,6 +41,20 @@ SEED = 50_003
 @pytest.fixture(scope="module")
 def subjects():
     return [generated_subject(SEED, k) for k in range(2)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pictures", MASKS)
+def test_masks_show_the_side_they_are_called_after(pictures):
+    one, two = (generated_subject(SEED, k, side_of(pictures)) for k in range(2))
+    pairs = {kind: make_pair(one, two, kind, pictures, SEED) for kind in ("same", "sign")}
+    for pair in pairs.values():
+        assert {a.intensity.kind for a in pair.angiograms} == {"mask"}
+        assert all(set(np.unique(a.pixels)) == {0, 255} for a in pair.angiograms)
+    for view in pairs["same"].angiograms:
+        seen = view.carm.project(one.line_mm)[0]
+        at = np.rint(seen).astype(int)
+        assert (view.pixels[at[:, 1], at[:, 0]] > 0).mean() > 0.7  # ends may be cut
 
 
 def real_files():
@@ -103,6 +117,8 @@ def test_a_real_tree_gives_the_pictures_of_the_protocol():
 @pytest.mark.parametrize("pictures", PICTURES)
 @pytest.mark.parametrize("kind", ["same", "two trees", "swapped"])
 def test_replayed_gates_are_those_of_the_engine(subjects, kind, pictures):
+    if side_of(pictures) == "right":
+        subjects = [generated_subject(SEED, k, "right") for k in range(2)]
     pair = make_pair(*subjects, kind, pictures, SEED)
     found = examined(pair, subjects[0], "x", pictures, open_engines())
     try:
@@ -117,11 +133,11 @@ def test_replayed_gates_are_those_of_the_engine(subjects, kind, pictures):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pictures", PICTURES)
+@pytest.mark.parametrize("pictures", ["path length", "raw"])
 def test_real_pictures_in_the_wrong_order_are_never_ok(pictures):
     engine = Engine(threads=1)
     for file in real_files()[::3]:
-        subject = real_subject(file)
+        subject = real_subject(file, side_of(pictures), pictures in MASKS)
         said = {}
         for kind in ("same", "swapped"):
             pair = make_pair(subject, subject, kind, pictures, 0)
@@ -175,13 +191,13 @@ def test_gates_are_chosen_where_pairs_part_and_left_where_nothing_is_gained():
     assert choose(easy, GATES) == GATES
 
 
-@pytest.mark.parametrize("calibrated", [True, False])
-def test_open_gates_let_any_disagreement_pass_unsaid(calibrated):
+@pytest.mark.parametrize("kind", ["exact", "raw", "mask"])
+def test_open_gates_let_any_disagreement_pass_unsaid(kind):
     """A finding of a gate in question would stay with the row whatever gate is tried later."""
     for engine in open_engines().values():
         gates = engine.options.quality
-        assert check_agreement(("1", "2"), 1.0, calibrated, gates) == []
-        assert check_order(("1", "2"), 1.0, 0.5, calibrated, gates) == ([], "")
+        assert check_agreement(("1", "2"), 1.0, kind, gates) == []
+        assert check_order(("1", "2"), 1.0, 0.5, kind, gates) == ([], "")
 
 
 def test_a_tree_that_did_not_come_out_is_no_loss():
