@@ -26,6 +26,7 @@ from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Image
 
 _THINNED = "no model was used: depth was decided by thinning the visual hull"
+_ALONE = "depth was decided by a model that sees one view at a time, which takes ghosts for vessels"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +126,7 @@ def find_centers(
     stop = watch.question
     if isinstance(predictor, SingleViewPredictor):
         alone = predictor.predict([(view.carm, view.path_mm) for view in seen.views], stop)
-        return Centers(merge_views(alone, seen.hull, seen.encoded))
+        return Centers(merge_views(alone, seen.hull, seen.encoded), findings=(_ALONE,))
     predicted = predictor.predict(seen.hull, seen.encoded, stop)
     others = []
     for number in range(1, options.predict.lattices):

@@ -109,6 +109,8 @@ def test_the_result_names_the_predictor(tmp_path):
     angiograms, grid, _ = tiny_case()
     result = Engine(TINY, options=SINGLE).reconstruct(angiograms, grid)
     assert result.predictor == "single" and result.model["name"] == "tiny-single"
+    assert result.status == "degraded"
+    assert any("one view at a time" in said for said in result.quality.findings)
     # The kind is read off the model where none is asked for.
     assert Engine(TINY).reconstruct(angiograms, grid).predictor == "single"
 
