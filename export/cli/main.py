@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -349,18 +351,31 @@ def pose_table(trees: int, out: Path) -> None:
 
 @main.command("train-segmenter")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
-@click.option("--steps", default=2500, show_default=True, help="Steps in all.")
-@click.option("--decay-steps", default=1700, show_default=True, help="Length of the final decay.")
+@click.option("--preset", type=click.Choice(["cpu", "gpu"]), default="cpu", show_default=True)
+@click.option("--steps", type=int, help="Steps in all.")
+@click.option("--decay-steps", type=int, help="Length of the final decay.")
+@click.option("--warmup-steps", type=int, help="Length of the rise at the start.")
+@click.option("--batch", type=int, help="Pictures of a step.")
+@click.option("--learning-rate", type=float)
+@click.option("--seed", type=int, help="Of the generated pictures and the crops.")
+@click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
+@click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
+@click.option("--warm-start", type=_FILE, help="Checkpoint whose weights to begin with.")
 @click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
-def train_segmenter(out: Path, steps: int, decay_steps: int, minutes: float | None) -> None:
-    """Train the segmentation network on generated angiograms; stop and go on at will.
+def train_segmenter(
+    out: Path, preset: str, warm_start: Path | None, minutes: float | None, **given: Any
+) -> None:
+    """Train the segmentation network on generated and real angiograms; stop and go on at will.
 
-    Example: gcar-export train-segmenter --out runs/s --minutes 45
+    Options that are not given are those of the preset: two CPU cores for an hour, or a GPU.
+
+    Example: gcar-export train-segmenter --out runs/s --real xca_masks --fold 1/5 --minutes 45
     """
     from gcar_export.training import segmenter as training
 
-    options = training.SegmenterOptions(steps=steps, decay_steps=decay_steps)
-    training.train(out, options, minutes=minutes)
+    options = training.chosen(preset, {k: v for k, v in given.items() if v is not None})
+    workers = (os.cpu_count() or 1) if options.device != "cpu" else 1
+    training.train(out, options, minutes=minutes, workers=workers, begin_from=warm_start)
 
 
 @main.command("export-segmenter")

@@ -11,17 +11,17 @@ from scipy import ndimage
 from gcar_deploy.types import Array, Image, Mask
 from gcar_export.scenes.raw_pictures import RawOptions, _anatomy
 
+#: pictures without any noise
+NOISELESS = 0.2
+#: guide wires and leads in a picture, on average
+WIRES = 0.25
 
-def scenery(
-    rng: np.random.Generator, side: int, pixel_mm: float, wires: float
-) -> tuple[Image, Image]:
-    """(side, side) attenuation of the patient and of devices, without vessels and catheter.
 
-    ``wires``: guide wires and leads in a picture, on average.
-    """
-    ground = _subtracted if rng.random() < 0.25 else _patient
+def scenery(rng: np.random.Generator, side: int, pixel_mm: float) -> tuple[Image, Image]:
+    """(side, side) attenuation of the patient and of devices, without vessels and catheter."""
+    ground = _subtracted if rng.random() < 0.2 else _patient
     out = ground(rng, side)
-    devices = _devices(rng, side, pixel_mm, wires)
+    devices = _devices(rng, side, pixel_mm)
     return out, np.asarray(cv2.GaussianBlur(devices, (0, 0), 0.7))
 
 
@@ -77,12 +77,18 @@ def _border(rng: np.random.Generator, side: int, softness: float) -> Array:
     return 1 / (1 + np.exp(np.clip(-off / softness, -50, 50)))
 
 
-def _devices(rng: np.random.Generator, side: int, pixel_mm: float, wires: float) -> Image:
-    """Attenuation of wires, leads, sternal wires and electrodes."""
+def _devices(rng: np.random.Generator, side: int, pixel_mm: float) -> Image:
+    """Attenuation of wires, leads, sternal wires, clips and electrodes."""
     out = np.zeros((side, side), np.float32)
-    for _ in range(rng.poisson(wires)):  # guide wires, pacing leads
+    for _ in range(rng.poisson(WIRES)):  # guide wires, pacing leads, coils of a defibrillator
         points = rng.uniform(-20, side + 20, (4, 2))
-        _stroke(out, list(points), rng.uniform(0.3, 1.2) / pixel_mm, rng.uniform(0.1, 0.6))
+        strength = rng.uniform(0.1, 0.6)
+        _stroke(out, list(points), rng.uniform(0.3, 1.8) / pixel_mm, strength)
+        if rng.random() < 0.3:
+            _stroke(out, list(points[1:3]), rng.uniform(1.5, 3.0) / pixel_mm, strength)
+    for _ in range(rng.poisson(0.3)):  # clips
+        at, way = rng.uniform(0, side, 2), rng.normal(0, 2.5 / pixel_mm, 2)
+        _stroke(out, [at, at + way], 1.0 / pixel_mm, rng.uniform(0.3, 1.0))
     if rng.random() < 0.1:  # sternal wires
         at = rng.uniform(0, side)
         for row in np.arange(rng.uniform(0, 40), side, rng.uniform(40, 80)):
@@ -128,30 +134,55 @@ def exposed(rng: np.random.Generator, absorbed: Image) -> tuple[Image, Mask]:
         edges = rng.integers(0, 22, 4)
         field[:] = False
         field[edges[0] : side - edges[1], edges[2] : side - edges[3]] = True
-    elif kind < 0.6:
+    elif kind < 0.5:
         row, col = (
             np.indices(field.shape) - side * (0.5 + rng.uniform(-0.15, 0.15, 2))[:, None, None]
         )
         field = np.hypot(row, col) < side * rng.uniform(0.48, 0.75)
     shade = np.where(field, 0.0, rng.uniform(1.5, 4.0))
-    light = ndimage.gaussian_filter(np.exp(-(absorbed + shade)), rng.uniform(0.3, 1.1))
-    quanta = float(np.exp(rng.uniform(np.log(150), np.log(8000))))
+    light = ndimage.gaussian_filter(np.exp(-(absorbed + shade)), rng.uniform(0.2, 1.1))
+    if rng.random() < NOISELESS:
+        return light.astype(np.float32), field
+    quanta = float(np.exp(rng.uniform(np.log(60), np.log(20000))))
     counts = rng.poisson(quanta * light) / quanta
     return ndimage.gaussian_filter(counts, rng.uniform(0.2, 1.0)).astype(np.float32), field
 
 
 def displayed(rng: np.random.Generator, light: Image, field: Mask) -> Array:
-    """Gamma or logarithm, edge enhancement, window, 8 bit, at times JPEG."""
-    picture = light ** rng.uniform(0.5, 1.3) if rng.random() < 0.6 else np.log(light + 0.03)
+    """Gamma or logarithm, edges enhanced, window, text, 8 bit; at times JPEG or too few pixels."""
+    picture = light ** rng.uniform(0.4, 1.5) if rng.random() < 0.6 else np.log(light + 0.03)
     if rng.random() < 0.5:
-        wide = ndimage.gaussian_filter(picture, rng.uniform(2, 8))
-        picture = picture + rng.uniform(0.2, 1.0) * (picture - wide)
-    low, high = np.quantile(picture[field], [rng.uniform(0, 0.02), 1 - rng.uniform(0, 0.03)])
-    floor, top = rng.uniform(0, 80), rng.uniform(150, 255)
+        wide = ndimage.gaussian_filter(picture, rng.uniform(1.5, 8))
+        picture = picture + rng.uniform(0.2, 2.0) * (picture - wide)
+    cut = 0.08 if rng.random() < 0.15 else 0.02
+    low, high = np.quantile(picture[field], [rng.uniform(0, cut), 1 - rng.uniform(0, 1.5 * cut)])
+    floor, top = rng.uniform(0, 80), rng.uniform(110, 255)
     grey = floor + (top - floor) * (picture - low) / max(float(high - low), 1e-9)
     out = np.clip(grey, 0, 255).round().astype(np.uint8)
+    if rng.random() < 0.08:
+        _write(rng, out)
+    if rng.random() < 0.12:
+        out = _coarse(out, float(rng.uniform(1.2, 2.5)))
     if rng.random() < 0.4:
-        quality = int(rng.uniform(55, 95))
+        quality = int(rng.uniform(30, 95))
         _, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, quality])
         out = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     return out
+
+
+def _write(rng: np.random.Generator, out: Array) -> None:
+    """Burn letters in, white or black, in a corner or anywhere."""
+    side = out.shape[0]
+    size, colour = rng.uniform(0.25, 0.7), int(rng.choice([0, 255]))
+    for _ in range(rng.integers(1, 4)):
+        letters = "".join(chr(c) for c in rng.integers(48, 91, rng.integers(2, 10)))
+        col, row = (int(x) for x in rng.uniform(0, (0.8 * side, side)))
+        cv2.putText(out, letters, (col, row), cv2.FONT_HERSHEY_SIMPLEX, size, colour)
+
+
+def _coarse(out: Array, factor: float) -> Array:
+    """Take pixels away and blow the rest up again, as a small picture is before it is looked at."""
+    side = out.shape[0]
+    few = max(8, round(side / factor))
+    small = cv2.resize(out, (few, few), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(small, (side, side), interpolation=cv2.INTER_LINEAR))

@@ -13,13 +13,15 @@ from gcar_deploy.types import Array, Image, Mask
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import SyntheticTree, random_tree
 
-#: a catheter's outer diameter (5 to 8 F) and the share of it that its lumen has, mm
-CATHETER_MM = (1.6, 2.7)
-LUMEN_SHARE = (0.6, 0.8)
+#: a catheter's outer diameter (4 to 9 F), mm; what it absorbs as a share of a vessel as wide; and
+#: how many show their walls more than their lumen
+CATHETER_MM = (1.3, 3.0)
+CATHETER_SHARE = (0.35, 1.0)
+HOLLOW = 0.2
 #: twigs wider than this are drawn by experts, thinner ones by some, pixels
 DRAWN_PX = 2.5
-#: long even branches at most, where devices are not to be learned from
-LONG_BRANCHES = 4
+#: long even branches at most, which look like wires and are none
+LONG_BRANCHES = 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,20 +42,15 @@ class Vessels:
     heading: Array
 
 
-def random_vessels(
-    rng: np.random.Generator, side: int, pixel_mm: float, lenient: bool = False
-) -> Vessels:
-    """Draw one tree from a random direction, at times only a part of it, and wriggle it.
-
-    ``lenient``: with long even branches, which look like wires and are none.
-    """
+def random_vessels(rng: np.random.Generator, side: int, pixel_mm: float) -> Vessels:
+    """Draw one tree from a random direction, at times only a part of it, and wriggle it."""
     tree = random_tree(rng).sides("left" if rng.random() < 0.65 else "right")
     carm = _view(rng, tree, side, pixel_mm)
     path = _filled(rng, tree, carm) / np.float32(pixel_mm)
     start = carm.project(tree.vessels[0].points_mm[:6])[0]
     twigs, thin = _twigs(rng, path)
     path = np.maximum(path, twigs)
-    if lenient:
+    if rng.random() < 0.5:
         path = np.maximum(path, _long_branches(rng, path))
     wave = _wave(rng, side)
     bent = cv2.remap(path, *wave, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
@@ -184,10 +181,14 @@ def ribbon(out: Image, line: Array, width_px: float, top: float) -> None:
     np.maximum(part, small, out=part)
 
 
-def catheter(rng: np.random.Generator, vessels: Vessels, pixel_mm: float) -> Image:
-    """Chords, pixel edges, of what brings the contrast: from a border to the ostium, with spill.
+def catheter(rng: np.random.Generator, vessels: Vessels, pixel_mm: float) -> tuple[Image, Image]:
+    """Draw what brings the contrast, from a border to the ostium, and what is spilled there.
 
     The tip lies in the ostium along the vessel; the shaft bends once or twice on its way.
+
+    Returns
+    -------
+    tube, spill : (side, side) float32, chords in pixel edges
     """
     side = vessels.path_px.shape[0]
     out = np.zeros((side, side), np.float32)
@@ -203,13 +204,18 @@ def catheter(rng: np.random.Generator, vessels: Vessels, pixel_mm: float) -> Ima
     second = first + 0.5 * way + sideways
     line = _bezier(np.stack([tip, first, second, end]))
     width = rng.uniform(*CATHETER_MM) * mm
-    ribbon(out, line, width, width * rng.uniform(*LUMEN_SHARE))
+    ribbon(out, line, width, width * rng.uniform(*CATHETER_SHARE))
     if rng.random() < 0.15:  # a loop in the root, or a second catheter
         other = _bezier(np.stack([first, tip + rng.normal(0, 12, 2) * mm, end, end + 20]))
-        ribbon(out, other, 0.9 * width, 0.9 * width * rng.uniform(*LUMEN_SHARE))
+        ribbon(out, other, 0.9 * width, 0.9 * width * rng.uniform(*CATHETER_SHARE))
+    if rng.random() < HOLLOW:  # empty: its walls are denser than its lumen
+        lumen = np.zeros_like(out)
+        ribbon(lumen, line, 0.7 * width, rng.uniform(0.3, 0.8))
+        out *= 1 - lumen
+    spill = np.zeros_like(out)
     if rng.random() < 0.35:
-        out += _spill(rng, side, tip + back * rng.uniform(0, 8) * mm, pixel_mm)
-    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.6))
+        spill = _spill(rng, side, tip + back * rng.uniform(0, 8) * mm, pixel_mm)
+    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.6)), spill
 
 
 def _bezier(corners: Array) -> Array:

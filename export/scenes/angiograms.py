@@ -21,11 +21,17 @@ from gcar_export.scenes.angiogram_vessels import catheter, random_vessels
 SIDE = 256
 SURE_PX, PERHAPS_PX = 0.8, 0.25
 #: attenuation that is too little to be drawn by anyone
-FAINT = 0.015
-#: wires and leads in a picture on average, and how many pictures show a catheter; fewer where the
-#: network is not to lose a vessel to a look-alike, and what a pixel of a device then counts
-WIRES, CATHETERS = 0.35, 0.75
-LENIENT_WIRES, LENIENT_CATHETERS, LENIENT_WEIGHT = 0.1, 0.6, 0.2
+FAINT = 0.02
+#: pictures with nothing but vessels, of any contrast; of the others, how many show a catheter; and
+#: how much a pixel of a device counts where vessels are asked for: not to lose a vessel to a
+#: look-alike
+PLAIN, CATHETERS, DEVICE_WEIGHT = 0.15, 0.65, 0.5
+#: attenuation of the contrast agent, 1/mm: hardly seen to saturated
+CONTRAST = (0.03, 0.5)
+#: size of a pixel, mm: fields of 80 to 240 mm at the size that the network looks at
+PIXEL_MM = (0.22, 0.7)
+#: grey values by which a vessel on even ground is seen
+PLAIN_DROP = 6.0
 #: attenuation from which a pixel is one of a device
 DEVICE = 0.01
 
@@ -38,10 +44,10 @@ class GeneratedAngiogram:
     ----------
     pixels : (SIDE, SIDE) uint8, vessels dark
     mask : (SIDE, SIDE) bool, coronary vessels alone
-    unsure : (SIDE, SIDE) bool, rims, twigs and faint vessels that an expert may draw or leave out
-    device : (SIDE, SIDE) bool, catheter, wires, leads, spilled contrast outside vessels
+    unsure : (SIDE, SIDE) bool, twigs and faint vessels that an expert may draw or leave out
+    device : (SIDE, SIDE) bool, catheter, wires, leads outside vessels
     path_px : (SIDE, SIDE) float32, chords through vessels, in pixel edges at the isocentre
-    pixel_mm, told_mm : float, at the isocentre: true, and as the runtime would think
+    pixel_mm : float, at the isocentre
     """
 
     pixels: Array
@@ -50,65 +56,100 @@ class GeneratedAngiogram:
     device: Mask
     path_px: Image
     pixel_mm: float
-    told_mm: float
 
 
-def generated_angiogram(seed: int, index: int, lenient: bool = False) -> GeneratedAngiogram:
-    """Picture ``index`` of a stream; the same for the same arguments.
-
-    ``lenient``: with fewer devices and more vessels that look like one.
-    """
+def generated_angiogram(seed: int, index: int) -> GeneratedAngiogram:
+    """Picture ``index`` of a stream; the same for the same arguments."""
     rng = np.random.default_rng([seed, index])
-    # Vessels have a known size only as far as the field is known: often it is not.
-    told_mm = float(rng.uniform(0.48, 0.62))
-    pixel_mm = told_mm / float(np.exp(rng.uniform(np.log(0.9), np.log(2.4))))
-    vessels = random_vessels(rng, SIDE, pixel_mm, lenient)
+    pixel_mm = _between(rng, PIXEL_MM)
+    contrast = _between(rng, CONTRAST)
+    vessels = random_vessels(rng, SIDE, pixel_mm)
     path_px = moved(rng, vessels.path_px)
-    tube = np.zeros_like(path_px)
-    if rng.random() < (LENIENT_CATHETERS if lenient else CATHETERS):
-        tube = catheter(rng, vessels, pixel_mm)
-    filled = np.maximum(path_px, tube)
-    contrast = float(np.exp(rng.uniform(np.log(0.025), np.log(0.16))))
-    patient, devices = scenery(rng, SIDE, pixel_mm, LENIENT_WIRES if lenient else WIRES)
+    if rng.random() < PLAIN:
+        return _plain(rng, vessels.doubtful, path_px, pixel_mm)
+    tube = spill = np.zeros_like(path_px)
+    if rng.random() < CATHETERS:
+        tube, spill = catheter(rng, vessels, pixel_mm)
+    filled = np.maximum(path_px, tube) + spill
+    patient, devices = scenery(rng, SIDE, pixel_mm)
     absorbed: Array = (
         contrast * pixel_mm * filled + cv2.GaussianBlur(patient, (0, 0), 0.7) + devices
     )
-    pixels, field = exposed(rng, absorbed)
+    light, field = exposed(rng, absorbed)
     seen = contrast * pixel_mm * path_px > FAINT
     mask = (path_px > SURE_PX) & ~vessels.doubtful & seen
     return GeneratedAngiogram(
-        pixels=displayed(rng, pixels, field),
+        pixels=displayed(rng, light, field),
         mask=mask & field,
-        unsure=(path_px > PERHAPS_PX) & ~mask & field,
+        unsure=(path_px > PERHAPS_PX) & ~mask & ~_rim(mask) & field,
         device=((contrast * pixel_mm * tube > DEVICE) | (devices > DEVICE))
-        & (path_px <= PERHAPS_PX),
+        & (path_px <= PERHAPS_PX)
+        & field,
         path_px=np.where(field, path_px, np.float32(0)),
         pixel_mm=pixel_mm,
-        told_mm=told_mm,
     )
 
 
-def training_pair(seed: int, index: int, lenient: bool = False) -> tuple[Array, Array]:
-    """Return the network's input and truth of a picture, flipped at random.
+def _rim(mask: Mask) -> Mask:
+    """Mask with what is so near to a sure vessel that it is the rim, which is not drawn."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
-    The input is made by the code that makes it at run time, collimator search included.
+
+def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """Draw evenly on a logarithmic scale."""
+    return float(np.exp(rng.uniform(*np.log(bounds))))
+
+
+def _plain(
+    rng: np.random.Generator, doubtful: Mask, path_px: Image, pixel_mm: float
+) -> GeneratedAngiogram:
+    """Dark vessels on an even ground, as deep as they are or drawn as flat areas."""
+    flat = rng.random() < 0.5
+    depth = np.clip(path_px, 0, 1) if flat else path_px / max(float(path_px.max()), 1.0)
+    ground = float(rng.uniform(60, 255))
+    drop = ground * float(rng.uniform(0.15, 1.0)) * depth
+    light = ground - drop
+    if rng.random() < 0.4:
+        light = light + rng.normal(0, rng.uniform(0.5, 12), light.shape)
+    # Thin twigs are as plain to see as anything: drawn flat, nothing is doubtful.
+    mask = path_px > (0.5 if flat else SURE_PX)
+    mask &= (flat | ~doubtful) & (drop > PLAIN_DROP)
+    return GeneratedAngiogram(
+        pixels=np.clip(light, 0, 255).round().astype(np.uint8),
+        mask=mask,
+        unsure=(path_px > PERHAPS_PX) & ~mask & ~_rim(mask),
+        device=np.zeros_like(mask),
+        path_px=path_px,
+        pixel_mm=pixel_mm,
+    )
+
+
+def network_input(pixels: Array) -> tuple[Array, Mask]:
+    """Make the network's input of a picture with dark vessels, and where it shows nothing.
+
+    Made by the code that makes it at run time, collimator search included.
+    """
+    counts = pixels.astype(np.float32)
+    holes = enhance.collimator(counts)
+    white = max(float(np.percentile(counts, 99.5)), 1e-12)
+    return net_input(enhance.absorbance(counts / np.float32(white)), holes), holes
+
+
+def training_pair(seed: int, index: int) -> tuple[Array, Array]:
+    """Return the network's input and truth of a picture, flipped at random.
 
     Returns
     -------
     channels : (CHANNELS, SIDE, SIDE) float32
-    truth : (3, SIDE, SIDE) float32: vessel, weight of a pixel for that question, chord in pixel
-        edges
+    truth : (5, SIDE, SIDE) float32: vessel, weight of a pixel for that question, chord in pixel
+        edges, device, weight of that question
     """
-    made = generated_angiogram(seed, index, lenient)
-    pixels = made.pixels.astype(np.float32)
-    holes = enhance.collimator(pixels)
-    white = max(float(np.percentile(pixels, 99.5)), 1e-12)
-    picture = enhance.absorbance(pixels / np.float32(white))
-    channels = net_input(picture, holes, made.told_mm)
+    made = generated_angiogram(seed, index)
+    channels, holes = network_input(made.pixels)
     weight = np.where(made.unsure, 0.0, 1.0)
-    if lenient:
-        weight[made.device] = LENIENT_WEIGHT
-    truth = np.stack([made.mask, weight, made.path_px]).astype(np.float32)
+    weight[made.device] = DEVICE_WEIGHT
+    known = np.where(made.path_px > PERHAPS_PX, np.where(made.mask, 1.0, 0.0), 1.0)
+    truth = np.stack([made.mask, weight, made.path_px, made.device, known]).astype(np.float32)
     truth[:, holes] = 0.0
     turn = np.random.default_rng([seed, index, 2]).integers(0, 2, 3)
     for axis in range(2):
@@ -120,9 +161,10 @@ def training_pair(seed: int, index: int, lenient: bool = False) -> tuple[Array, 
 
 
 def picture_with_mask(made: GeneratedAngiogram) -> Array:
-    """(SIDE, 2 SIDE, 3) uint8: the picture, and beside it the truth in green."""
+    """(SIDE, 2 SIDE, 3) uint8: the picture, and beside it the truth: green, devices orange."""
     grey = cv2.cvtColor(made.pixels, cv2.COLOR_GRAY2BGR)
     drawn = grey.copy()
     drawn[made.mask] = (0.5 * drawn[made.mask] + np.array([0, 100, 0])).astype(np.uint8)
     drawn[made.unsure] = (0.7 * drawn[made.unsure] + np.array([70, 70, 0])).astype(np.uint8)
+    drawn[made.device] = (0.5 * drawn[made.device] + np.array([0, 60, 120])).astype(np.uint8)
     return np.concatenate([grey, drawn], axis=1)

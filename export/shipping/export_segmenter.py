@@ -55,9 +55,9 @@ class _Deployed(torch.nn.Module):
                 if isinstance(part, torch.nn.GroupNorm):
                     level[k] = _GroupNorm(part)
 
-    def forward(self, channels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        logit, chord = self.net(channels).split(1, dim=1)
-        return torch.sigmoid(logit), chord
+    def forward(self, channels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        logit, chord, device = self.net(channels).split(1, dim=1)
+        return torch.sigmoid(logit), chord, torch.sigmoid(device)
 
 
 def load_segmenter_checkpoint(path: Path) -> MaskUNet:
@@ -121,6 +121,7 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
 
 def _write_spec(checkpoint: Path, out: Path, net: torch.nn.Module) -> None:
     data = out.read_bytes()
+    training = json.loads((checkpoint.parent / "manifest.json").read_text())
     spec = {
         "schema": "gcar-model/1",
         "name": out.stem,
@@ -129,8 +130,8 @@ def _write_spec(checkpoint: Path, out: Path, net: torch.nn.Module) -> None:
         "outputs": list(OUTPUTS),
         "opset": OPSET,
         "ir_version": IR_VERSION,
-        "training": json.loads((checkpoint.parent / "manifest.json").read_text()),
-        "license": "Apache-2.0; trained on generated angiograms alone",
+        "training": training,
+        "license": "Apache-2.0; trained on " + training["data"],
         "sha256": hashlib.sha256(data).hexdigest(),
         "bytes": len(data),
         "parameters": sum(p.numel() for p in net.parameters()),
@@ -150,5 +151,6 @@ def _largest_difference(net: torch.nn.Module, out: Path, pictures: int) -> float
         seen = session.look(channels)
         difference = np.abs(torch_maps[0] - seen.probability)
         relative = np.abs(torch_maps[1] - seen.chord) / (1 + torch_maps[1])
-        worst = max(worst, float(difference.max()), float(relative.max()))
+        devices = np.abs(torch_maps[2] - seen.device)
+        worst = max(worst, *(float(d.max()) for d in (difference, relative, devices)))
     return worst

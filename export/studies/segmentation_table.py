@@ -3,23 +3,26 @@
     python -m gcar_export.studies.segmentation_table --data DIR
 
 ``DIR`` holds ``xca_masks`` (``N.png`` with ``N_gt.png``; at its top or under ``data/``) and
-``cases`` (``R_*``: raw pictures; ``C_*``: the same views as noise-free path lengths).
+``cases`` (``R_*``: raw pictures; ``C_*``: the same views as noise-free path lengths). ``--model``
+once per fold of a cross-validation scores each expert-masked picture by the model that left it
+out. A third table is of generated pictures, trivial to hard.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+import click
 import cv2
 import numpy as np
 
 from gcar_deploy.config import ImagingOptions, SegmenterName
-from gcar_deploy.errors import ModelError
+from gcar_deploy.errors import ModelError, RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import DEFAULT_FIELD_MM, Angiogram, VesselImage
@@ -28,9 +31,16 @@ from gcar_deploy.imaging.net import Segmenter, load_segmenter, open_segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.types import Image, Mask
+from gcar_export.scenes.expert_pictures import fold_edges
+from gcar_export.scenes.sanity_pictures import EACH, sanity_picture
+from gcar_export.studies.segmentation_page import write_page
 
 #: truth of the R_ cases: rays that cross at least this much vessel
 TRUTH_MM = 0.4
+#: a centreline is found where one is within so many pixels
+NEAR_PX = 2
+#: sizes of a pixel that are claimed for a generated picture, as multiples of the true one
+CLAIMED = (0.7, 1.0, 1.4)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,16 +49,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--each", action="store_true", help="one line per expert-masked picture")
     parser.add_argument("--segmenter", choices=("classic", "net", "auto"), default="auto")
-    parser.add_argument("--model", type=Path, help="ONNX file for net; by default the shipped one")
+    parser.add_argument(
+        "--model", type=Path, action="append",
+        help="ONNX file; by default the shipped one; several: one per fold, in their order",
+    )  # fmt: skip
+    parser.add_argument("--pixel-mm", type=float, help="taken for the expert-masked pictures' size")
+    parser.add_argument("--page", type=Path, help="HTML file with what was found in each picture")
     chosen = parser.parse_args(arguments)
-    net = None if chosen.segmenter == "classic" else network(chosen.model)
-    who = chosen.segmenter
+    nets = [network(path) for path in chosen.model or [None]]
     cv2.setNumThreads(1)
-    pairs = sorted(find(chosen.data, "xca_masks").glob("*_gt.png"))
-    if pairs:
-        _print_expert(pairs, chosen.each, net, who)
-    _print_cases(find(chosen.data, "cases"), net, who)
+    pairs = sorted(find(chosen.data, "xca_masks").glob("*_gt.png"), key=_number)
+    asked = Asked(chosen.segmenter, tuple(nets), chosen.pixel_mm)
+    rows: dict[str, dict[str, float]] = {}
+    seen = []
+    for k, path in enumerate(pairs):
+        scores, found = expert_score(path, asked.net(k, len(pairs)), asked.who, asked.pixel_mm)
+        rows[path.name.removesuffix("_gt.png")] = scores
+        seen.append((path, found, scores))
+    if rows:
+        _print_expert(rows, chosen.each, asked)
+    if chosen.page:
+        click.echo(write_page(seen, chosen.page))
+    if len(nets) == 1:
+        _print_cases(find(chosen.data, "cases"), nets[0], asked.who)
+        _print_generated(nets[0], asked.who)
     return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """Who finds vessels: a method, its network or one per fold, and the size of a pixel."""
+
+    who: SegmenterName
+    nets: tuple[Segmenter, ...]
+    pixel_mm: float | None
+
+    def net(self, index: int, count: int) -> Segmenter:
+        """Network that did not see picture ``index`` of ``count``, as ``expert_pictures.folds``."""
+        edges = fold_edges(count, len(self.nets))
+        return self.nets[int(np.searchsorted(edges, index, side="right")) - 1]
+
+
+def _number(path: Path) -> tuple[int, str]:
+    return len(path.name), path.name
 
 
 def find(data: Path, name: str) -> Path:
@@ -67,13 +110,16 @@ def network(path: Path | None) -> Segmenter:
 
 
 def expert_score(
-    truth_path: Path, net: Segmenter | None = None, who: SegmenterName = "auto"
+    truth_path: Path,
+    net: Segmenter | None = None,
+    who: SegmenterName = "auto",
+    pixel_mm: float | None = None,
 ) -> tuple[dict[str, float], VesselImage]:
     """Score one expert-masked picture; ``who`` finds the vessels, with ``net`` where given."""
     truth = read_picture(truth_path)[0] > 127
     picture = truth_path.with_name(truth_path.name.replace("_gt", ""))
     angiogram = Angiogram.without_geometry(
-        picture.stem, read_picture(picture), Intensity(kind="raw")
+        picture.stem, read_picture(picture), Intensity(kind="raw"), pixel_mm
     )
     start = time.process_time()
     found = extract_vessels(angiogram, ImagingOptions(segmenter=who), net)
@@ -82,8 +128,13 @@ def expert_score(
 
 
 def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
-    """Dice, sensitivity, precision of the mask; clDice as in Shit et al. 2021."""
+    """Dice, sensitivity, precision of the mask; clDice as in Shit et al. 2021.
+
+    ``recall``: share of the true centreline within ``NEAR_PX`` pixels of the one found.
+    """
     true_line = skeletonize(truth)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * NEAR_PX + 1, 2 * NEAR_PX + 1))
+    near = cv2.dilate(line.astype(np.uint8), disc) > 0
     common = float((mask & truth).sum())
     line_precision = float((line & truth).sum()) / max(1, int(line.sum()))
     line_recall = float((true_line & mask).sum()) / max(1, int(true_line.sum()))
@@ -92,6 +143,7 @@ def mask_scores(mask: Mask, line: Mask, truth: Mask) -> dict[str, float]:
         "sensitivity": common / max(1, int(truth.sum())),
         "precision": common / max(1, int(mask.sum())),
         "clDice": 2 * line_precision * line_recall / max(1e-12, line_precision + line_recall),
+        "recall": float((true_line & near).sum()) / max(1, int(true_line.sum())),
     }
 
 
@@ -132,33 +184,58 @@ def path_scores(path_mm: Image, truth_mm: Image) -> dict[str, float]:
     }
 
 
-def _print_expert(
-    pairs: Sequence[Path], each: bool, net: Segmenter | None, who: SegmenterName
-) -> None:
-    rows = {path.name.replace("_gt.png", ""): expert_score(path, net, who)[0] for path in pairs}
+def _print_expert(rows: Mapping[str, Mapping[str, float]], each: bool, asked: Asked) -> None:
     names = list(next(iter(rows.values())))
-    print(
-        f"Expert masks, {len(rows)} pictures (no geometry: field taken as {DEFAULT_FIELD_MM:g} mm)"
-    )
+    field = f"field taken as {DEFAULT_FIELD_MM:g} mm"
+    size = field if asked.pixel_mm is None else f"pixels taken as {asked.pixel_mm:g} mm"
+    folds = f", {len(asked.nets)} folds" if len(asked.nets) > 1 else ""
+    print(f"Expert masks, {len(rows)} pictures{folds} (no geometry: {size})")
     print("| picture | " + " | ".join(names) + " |")
     print("|---" * (len(names) + 1) + "|")
     if each:
         for picture, scores in rows.items():
             print(_line(picture, scores))
-    halves: dict[str, tuple[Callable[[list[float]], Any], dict[str, dict[str, float]]]] = {
-        "mean": (np.mean, rows),
-        "mean, odd numbers (options were chosen with them)": (np.mean, _numbered(rows, 1)),
-        "mean, even numbers": (np.mean, _numbered(rows, 0)),
-        "worst": (np.min, rows),
-    }
-    for label, (reduce, some) in halves.items():
-        if some:
-            print(_line(label, {n: float(reduce([r[n] for r in some.values()])) for n in names}))
+    for label, reduce in (("mean", np.mean), ("worst", np.min)):
+        reduced = {n: float(reduce([r[n] for r in rows.values()])) for n in names}
+        print(_line(label, reduced))
 
 
-def _numbered(rows: dict[str, dict[str, float]], rest: int) -> dict[str, dict[str, float]]:
-    """Pictures whose name is a number with this remainder after division by two."""
-    return {name: r for name, r in rows.items() if name.isdigit() and int(name) % 2 == rest}
+def generated_score(
+    number: int, net: Segmenter | None, who: SegmenterName = "auto", claimed: float = 1.0
+) -> tuple[str, dict[str, float]]:
+    """Kind and scores of a generated picture whose pixels are claimed to be so many times as large.
+
+    ``catheter left``: share of the catheter's pixels that are in the mask.
+    """
+    made = sanity_picture(number)
+    picture = (made.pixels.astype(np.float32), 8, "")
+    pixel_mm = claimed * made.carm.pixel_at_isocenter_mm
+    angiogram = Angiogram.without_geometry(str(number), picture, Intensity(kind="raw"), pixel_mm)
+    try:
+        found = extract_vessels(angiogram, ImagingOptions(segmenter=who), net)
+    except RefusedError:
+        nothing = np.zeros_like(made.mask)
+        return made.kind, mask_scores(nothing, nothing, made.mask) | {"catheter left": 0.0}
+    left = float((found.mask & made.catheter).sum()) / max(1, int(made.catheter.sum()))
+    scores = mask_scores(found.mask, found.skeleton, made.mask)
+    return made.kind, scores | {"catheter left": left}
+
+
+def _print_generated(net: Segmenter | None, who: SegmenterName) -> None:
+    rows: dict[str, list[dict[str, float]]] = {}
+    for claimed in CLAIMED:
+        for number in range(3 * EACH):
+            kind, scores = generated_score(number, net, who, claimed)
+            rows.setdefault(f"{kind}, pixels said to be {claimed:g} times as large", []).append(
+                scores
+            )
+    names = list(next(iter(rows.values()))[0])
+    print("\nGenerated pictures (mean; lowest Dice)")
+    print("| pictures | " + " | ".join(names) + " | lowest Dice |")
+    print("|---" * (len(names) + 2) + "|")
+    for label, some in rows.items():
+        means = {n: float(np.mean([r[n] for r in some])) for n in names}
+        print(_line(label, means | {"lowest": min(r["Dice"] for r in some)}))
 
 
 def _print_cases(cases: Path, net: Segmenter | None, who: SegmenterName) -> None:

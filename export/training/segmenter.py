@@ -1,4 +1,4 @@
-"""Train the segmentation network on generated angiograms, in pieces of any length.
+"""Train the segmentation network on generated and real angiograms, in pieces of any length.
 
 A run is a folder: ``checkpoint.safetensors`` (weights, optimiser state, step), ``manifest.json``
 (options, versions, scores), ``log.csv``. Picture i is a function of (seed, i), the learning rate
@@ -14,8 +14,9 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 import cv2
@@ -23,7 +24,9 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from gcar_export.scenes.angiograms import training_pair
+from gcar_deploy.errors import UsageError
+from gcar_export.scenes.angiograms import SIDE, training_pair
+from gcar_export.scenes.expert_pictures import ExpertPicture, expert_pair, expert_pictures, folds
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 
 #: pictures with this seed are for choosing and reporting, never for training
@@ -36,9 +39,12 @@ class SegmenterOptions:
 
     Attributes
     ----------
-    lenient_from : int, step from which devices are rarer and count less: first what a line of
-        contrast is, then not to lose a vessel to a look-alike
     bfloat16 : bool, the network's layers in half the bits, its weights in single precision
+    device : str, where torch works: ``cpu`` or ``cuda``
+    real : str, folder of real angiograms with expert masks (``expert_pictures``); empty for none
+    fold : (number, of how many) that is left out of them; (0, 0) leaves none out
+    real_share : float, of the pictures of a step, where there are real ones
+    crop : int, side of what is cut out of a picture, pixels; a multiple of the network's stride
     """
 
     seed: int = 1
@@ -51,12 +57,49 @@ class SegmenterOptions:
     validation_pictures: int = 40
     save_every: int = 50
     bfloat16: bool = True
-    lenient_from: int = 1800
+    device: str = "cpu"
+    real: str = ""
+    fold: tuple[int, int] = (0, 0)
+    real_share: float = 0.5
+    crop: int = SIDE
 
 
+#: two cores for an hour; a GPU with the cores to draw pictures for it
+PRESETS = {
+    "cpu": SegmenterOptions(),
+    "gpu": SegmenterOptions(
+        steps=20_000, decay_steps=12_000, warmup_steps=500, batch=48, device="cuda", save_every=500
+    ),
+}
+#: three steps, for tests
 TINY = SegmenterOptions(
     steps=3, decay_steps=1, warmup_steps=1, batch=1, validation_pictures=2, save_every=2
 )
+
+
+def chosen(preset: str, given: Mapping[str, Any]) -> SegmenterOptions:
+    """Return a preset's options with others in place of some; ``fold`` as ``K/N``, paths as such.
+
+    Raises
+    ------
+    UsageError
+        A fold that is not two numbers.
+    """
+    changed = dict(given)
+    if "fold" in changed:
+        number, slash, of = str(changed["fold"]).partition("/")
+        if not (slash and number.isdigit() and of.isdigit()):
+            raise UsageError(f"fold {changed['fold']}: must be K/N, for example 1/5")
+        changed["fold"] = (int(number), int(of))
+    if "real" in changed:
+        changed["real"] = str(changed["real"])
+    options = dataclasses.replace(PRESETS[preset], **changed)
+    # A run that was made shorter decays and warms up within itself.
+    return dataclasses.replace(
+        options,
+        decay_steps=min(options.decay_steps, options.steps),
+        warmup_steps=max(1, min(options.warmup_steps, options.steps // 4)),
+    )
 
 
 def learning_rate(options: SegmenterOptions, step: int) -> float:
@@ -92,38 +135,49 @@ def chord_loss(chords: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor) 
 
 
 def total_loss(out: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """Of (n, 2, rows, cols) answers against (n, 3, rows, cols) truths of ``training_pair``."""
-    mask, weight, chord = truth.unbind(1)
-    return mask_loss(out[:, 0], mask, weight) + 2 * chord_loss(out[:, 1], chord, weight)
+    """Of (n, 3, rows, cols) answers against (n, 5, rows, cols) truths of ``training_pair``."""
+    mask, weight, chord, device, known = truth.unbind(1)
+    vessel = mask_loss(out[:, 0], mask, weight) + 2 * chord_loss(out[:, 1], chord, weight)
+    return vessel + 0.5 * mask_loss(out[:, 2], device, known)
 
 
 class Stream(torch.utils.data.Dataset):
-    """Pictures 0 .. of a stream, made where and when they are asked for."""
+    """Pictures 0 .. of a stream, made where and when they are asked for.
 
-    def __init__(self, seed: int, length: int, lenient_from: int) -> None:
-        self.seed, self.length, self.lenient_from = seed, length, lenient_from
+    Of each ``batch`` the first ``real_share`` are crops of real pictures, where there are any.
+    """
+
+    def __init__(self, options: SegmenterOptions, real: Sequence[ExpertPicture] = ()) -> None:
+        self.options, self.real = options, real
 
     def __len__(self) -> int:
-        return self.length
+        return self.options.steps * self.options.batch
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         cv2.setNumThreads(1)
-        x, y = training_pair(self.seed, index, index >= self.lenient_from)
-        return torch.from_numpy(x), torch.from_numpy(y)
+        batch, seed = self.options.batch, self.options.seed
+        if self.real and index % batch < round(self.options.real_share * batch):
+            x, y = expert_pair(self.real, seed, index)
+        else:
+            x, y = training_pair(seed, index)
+        top, left = np.random.default_rng([seed, index, 4]).integers(
+            0, SIDE - self.options.crop + 1, 2
+        )
+        part = slice(top, top + self.options.crop), slice(left, left + self.options.crop)
+        return torch.from_numpy(x[:, *part].copy()), torch.from_numpy(y[:, *part].copy())
 
 
 def batches(
-    options: SegmenterOptions, first_step: int, workers: int
+    options: SegmenterOptions, real: Sequence[ExpertPicture], first_step: int, workers: int
 ) -> Iterator[list[torch.Tensor]]:
-    """Yield inputs and truths, both (batch, 3, n, n), of each step from ``first_step`` on."""
-    stream = Stream(
-        options.seed, options.steps * options.batch, options.lenient_from * options.batch
-    )
+    """Yield inputs (batch, 3, n, n) and truths (batch, 5, n, n) of each step from the first on."""
     order = [
         list(range(k * options.batch, (k + 1) * options.batch))
         for k in range(first_step, options.steps)
     ]
-    yield from torch.utils.data.DataLoader(stream, batch_sampler=order, num_workers=workers)
+    yield from torch.utils.data.DataLoader(
+        Stream(options, real), batch_sampler=order, num_workers=workers
+    )
 
 
 @torch.no_grad()
@@ -131,9 +185,8 @@ def validate(net: MaskUNet, options: SegmenterOptions) -> float:
     """Mean Dice at 0.5 over held-out generated pictures."""
     net.eval()
     scores = []
-    stream = Stream(VALIDATION_SEED, options.validation_pictures, options.validation_pictures)
     for k in range(options.validation_pictures):
-        x, y = stream[k]
+        x, y = (torch.from_numpy(a).to(options.device) for a in training_pair(VALIDATION_SEED, k))
         asked = y[1] > 0
         found, true = (net(x[None])[0, 0] >= 0) & asked, (y[0] >= 0.5) & asked
         both = float((found & true).sum())
@@ -142,18 +195,39 @@ def validate(net: MaskUNet, options: SegmenterOptions) -> float:
     return float(np.mean(scores))
 
 
+def real_pictures(options: SegmenterOptions) -> tuple[ExpertPicture, ...]:
+    """Return the real pictures that these options train on.
+
+    Raises
+    ------
+    UsageError
+        A fold that there is not, or without pictures.
+    """
+    number, of = options.fold
+    if (number, of) == (0, 0):
+        return expert_pictures(Path(options.real)) if options.real else ()
+    if not (options.real and of >= 2 and 1 <= number <= of):
+        raise UsageError(f"fold {number}/{of}: must be 1/n .. n/n (n >= 2) of real pictures")
+    return folds(expert_pictures(Path(options.real)), number, of)[0]
+
+
 def train(
-    out: Path, options: SegmenterOptions, *, minutes: float | None = None, workers: int = 1
-) -> None:
+    out: Path, options: SegmenterOptions, *, minutes: float | None = None, workers: int = 1,
+    begin_from: Path | None = None,
+) -> None:  # fmt: skip
     """Train or go on training in ``out``; stop after ``minutes`` if given.
 
     The decay is a function of the step, so a run cut short has not settled: ``finish`` it by a
-    call with fewer ``steps``.
+    call with fewer ``steps``. A new run begins with the weights of the checkpoint ``begin_from``
+    if given.
     """
     out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
-    net = MaskUNet(MaskUNetConfig()).train()
+    real = real_pictures(options)
+    net = MaskUNet(MaskUNetConfig()).to(options.device, memory_format=torch.channels_last).train()
+    if begin_from is not None:
+        net.load_state_dict(_weights(load_file(begin_from)))
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
@@ -161,20 +235,12 @@ def train(
     began, losses = time.time(), []
     with click.progressbar(length=options.steps, label="segmenter", file=sys.stderr) as bar:
         bar.update(step)
-        for x, y in batches(options, step, workers):
+        for x, y in batches(options, real, step, workers):
             if minutes is not None and time.time() - began > 60 * minutes:
                 break
             for group in optimiser.param_groups:
                 group["lr"] = learning_rate(options, step)
-            with torch.autocast("cpu", torch.bfloat16, enabled=options.bfloat16):
-                out_maps = net(x)
-            loss = total_loss(out_maps.float(), y)
-            optimiser.zero_grad()
-            loss.backward()
-            norm = torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-            if bool(torch.isfinite(norm)):
-                optimiser.step()
-            losses.append(float(loss.detach()))
+            losses.append(_step(net, optimiser, (x, y), options))
             step += 1
             bar.update(1)
             if step % options.save_every == 0:
@@ -182,12 +248,32 @@ def train(
     _checkpoint(out, net, optimiser, step, options, losses, validate(net, options))
 
 
+def _step(
+    net: MaskUNet, optimiser: torch.optim.Optimizer, pair: Sequence[torch.Tensor],
+    options: SegmenterOptions,
+) -> float:  # fmt: skip
+    x, y = pair[0].to(options.device, memory_format=torch.channels_last), pair[1].to(options.device)
+    with torch.autocast(options.device, torch.bfloat16, enabled=options.bfloat16):
+        maps = net(x)
+    loss = total_loss(maps.float(), y)
+    optimiser.zero_grad()
+    loss.backward()
+    norm = torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+    if bool(torch.isfinite(norm)):
+        optimiser.step()
+    return float(loss.detach())
+
+
+def _weights(data: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {k[4:]: v for k, v in data.items() if k.startswith("net.")}
+
+
 def _resume(out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer) -> int:
     path = out / "checkpoint.safetensors"
     if not path.exists():
         return 0
     data = load_file(path)
-    net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
+    net.load_state_dict(_weights(data))
     state = {}
     for n, (name, _) in enumerate(net.named_parameters()):
         if f"opt.{name}.exp_avg" in data:
@@ -212,8 +298,9 @@ def _checkpoint(
         "schema": "gcar-training/1",
         "network": "mask-unet",
         "config": dataclasses.asdict(net.config),
-        "options": dataclasses.asdict(options),
-        "data": "generated angiograms: gcar_export.scenes.angiograms, picture step * batch + k",
+        "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
+        "data": "generated angiograms: gcar_export.scenes.angiograms, picture step * batch + k"
+        + ("; crops of real ones with expert masks" if options.real else ""),
         "step": step,
         "validation_seed": VALIDATION_SEED,
         "validation_dice": dice,

@@ -16,20 +16,20 @@ import numpy as np
 
 from gcar_deploy.imaging import enhance, segment
 from gcar_deploy.imaging import skeleton as skel
-from gcar_deploy.imaging.catheter import catheters
-from gcar_deploy.imaging.net import Segmenter, net_input
+from gcar_deploy.imaging.net import Seen, Segmenter, at_network_size, net_input
 from gcar_deploy.types import Image, Mask
 
 #: hysteresis on the network's probability, for paths and for the mask: a path where there is none
 #: costs less than one that is missing
-PATH_LEVELS = (0.6, 0.9)
-MASK_LEVELS = (0.9, 0.98)
+PATH_LEVELS = (0.3, 0.6)
+MASK_LEVELS = (0.5, 0.8)
+#: a side branch shorter than this is a spur, pixels of the network
+SPUR_PX = 12
 #: an end of a branch shallower than this share of the main vessels is a twig
-TWIG_SHARE = 0.2
-#: rim of the mask, as a share of the path in the middle: what observers draw
-RIM_SHARE = 0.65
-#: paths are averaged over so much of the line before they say where the rim is, mm
-_SMOOTH_MM = 1.5
+TWIG_SHARE = 0.15
+#: hysteresis on the probability of a device, and how long one is at least, pixels of the network
+DEVICE_LEVELS = (0.5, 0.8)
+DEVICE_PX = 30
 
 
 def learned_vessels(
@@ -52,77 +52,73 @@ def learned_vessels(
     Returns
     -------
     found : Segmentation, at the picture's own size
-        The mask ends where an observer sees the rim, at a share of the path in the middle; its
-        ``vesselness`` is the network's probability.
+        The mask is where the network says vessel; its ``vesselness`` is the probability. Nothing
+        of it depends on ``pixel_mm``.
     path_mm : (rows, cols) float32
         Length of the ray within vessel, 0 away from vessels; it reaches beyond the mask.
     """
     search = pictures.get("search", next(iter(pictures.values())))
-    work, work_holes, work_mm = segment.at_working_size(search, holes, pixel_mm)
-    seen = segmenter.look(net_input(work, work_holes, work_mm))
+    work, work_holes = at_network_size(search, holes)
+    seen = segmenter.look(net_input(work, work_holes))
+    seen = dataclasses.replace(
+        seen, probability=np.where(work_holes, np.float32(0), seen.probability)
+    )
     full = search.shape[::-1]
-    probability = np.where(work_holes, np.float32(0), seen.probability)
-    reach = support(probability, seen.chord, work_mm, PATH_LEVELS)
-    reach, device = _without_catheters(reach, work, work_holes, work_mm)
+    work_mm = np.float32(pixel_mm * np.sqrt(search.size / work.size))
+    reach = support(seen, PATH_LEVELS)
     near = (segment.resize(reach.astype(np.float32), full) >= 0.5) & ~holes
-    sure = support(probability, seen.chord, work_mm, MASK_LEVELS) & reach
-    chord = np.where(near, segment.resize(seen.chord, full) * np.float32(work_mm), np.float32(0))
+    sure = support(seen, MASK_LEVELS)
+    around = cv2.dilate(sure.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
+    probability = np.where(holes, np.float32(0), segment.resize(seen.probability, full))
+    # The rim is where the answer crosses one half: between the network's own pixels.
+    mask = (probability >= 0.5) & (segment.resize(around, full) >= 0.5)
+    mask |= (segment.resize(sure.astype(np.float32), full) >= 0.5) & ~holes
+    near |= mask
+    chord = np.where(near, segment.resize(seen.chord, full) * work_mm, np.float32(0))
     laws = {name: picture for name, picture in pictures.items() if name != "search"}
     contrast = _scaled_contrast(laws, holes, near, chord, pixel_mm)
-    path = np.asarray(0.5 * (chord + contrast), dtype=np.float32)
-    surely = (segment.resize(sure.astype(np.float32), full) >= 0.5) & near
-    mask = _drawn(path, surely, pixel_mm)
+    device = _devices(seen, sure)
     found = dataclasses.replace(
         segment.given(search, mask, holes, pixel_mm),
-        vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
-        catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~near,
-        catheter_mm=int(skel.skeletonize(device).sum()) * work_mm,
+        vesselness=probability,
+        catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~mask,
+        catheter_mm=int(skel.skeletonize(device).sum()) * float(work_mm),
     )
-    return found, path
+    return found, np.asarray(0.5 * (chord + contrast), dtype=np.float32)
 
 
-def support(
-    probability: Image,
-    chord: Image,
-    pixel_mm: float,
-    levels: tuple[float, float],
-) -> Mask:
+def support(seen: Seen, levels: tuple[float, float]) -> Mask:
     """Where vessels are: hysteresis on the probability, without twigs and small parts.
 
     Parameters
     ----------
-    probability, chord : (rows, cols) float32, as the network says them
-    pixel_mm : float
+    seen : Seen, as the network says it
     levels : lower and upper one of the hysteresis
 
     Returns
     -------
     (rows, cols) bool, out to where a vessel fades
     """
-    reach = skel.parts_touching(probability >= levels[0], probability >= levels[1])
+    reach = skel.parts_touching(seen.probability >= levels[0], seen.probability >= levels[1])
     line = whole = skel.skeletonize(reach)
     if not line.any():
         return np.zeros_like(reach)
-    deep = np.asarray(cv2.GaussianBlur(chord, (0, 0), 0.7), dtype=np.float32)
+    deep = np.asarray(cv2.GaussianBlur(seen.chord, (0, 0), 0.7), dtype=np.float32)
     top = float(np.percentile(deep[line], 90))
-    line = skel.prune(line, deep, segment.SPUR_MM / pixel_mm, TWIG_SHARE * top)
+    line = skel.prune(line, deep, SPUR_PX, TWIG_SHARE * top)
     if line.any():
         line = skel.strong_parts(line, deep, segment.PART_SHARE)
     return skel.beside(reach, whole, line)
 
 
-def _without_catheters(reach: Mask, work: Image, holes: Mask, pixel_mm: float) -> tuple[Mask, Mask]:
-    """(rows, cols) bool each: what stays vessel, and what is taken for a catheter."""
-    line = skel.skeletonize(reach)
-    taken = np.zeros_like(reach)
-    if line.any():
-        flat = enhance.flatten(work, enhance.FLATTEN_SIGMA_MM / pixel_mm)
-        width = enhance.ridges(flat, pixel_mm).sigma_px
-        taken = catheters(line, flat, width, ~holes, pixel_mm)
-    if not taken.any():
-        return reach, taken
-    kept = skel.beside(reach, line, line & ~taken)
-    return kept, reach & ~kept
+def _devices(seen: Seen, vessel: Mask) -> Mask:
+    """(rows, cols) bool: catheters, leads and wires that are longer than a speck."""
+    device = skel.parts_touching(seen.device >= DEVICE_LEVELS[0], seen.device >= DEVICE_LEVELS[1])
+    device &= ~vessel
+    _, label, stats, _ = cv2.connectedComponentsWithStats(device.astype(np.uint8))
+    long = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= DEVICE_PX
+    long[0] = False
+    return long[label]
 
 
 def _scaled_contrast(
@@ -147,14 +143,3 @@ def _scaled_contrast(
             scale = np.float32((c * q).sum() / (c * c).sum())
             best, agreement = np.where(near, rise * scale, np.float32(0)), alike
     return best if agreement > -np.inf else chord
-
-
-def _drawn(path: Image, near: Mask, pixel_mm: float) -> Mask:
-    """(rows, cols) bool: where an observer would draw the rims, and no thinner than a line."""
-    line = skel.skeletonize(near)
-    if not line.any():
-        return line
-    line = skel.prune(line, path, segment.SPUR_MM / pixel_mm, 0.0)
-    smooth = cv2.GaussianBlur(path, (0, 0), max(0.7, 0.35 / pixel_mm))
-    _, (peak,) = skel.spread(line, (smooth,), _SMOOTH_MM / pixel_mm)
-    return ((smooth > RIM_SHARE * peak) | line) & near

@@ -1,10 +1,11 @@
 """A small network that finds vessels: its input, its session, and lines from its answer.
 
-The network sees the picture at a known pixel size, flattened twice and scaled, beside the ridge
-response of the classical method: three channels that look much alike in generated and real
-pictures, whatever the display did to the grey values. It answers how probably a pixel is vessel
-and how long the chord through vessel is there, in pixel edges: a vessel's width is in the picture,
-and a round vessel is as deep as it is wide.
+The network sees the picture at a fixed number of pixels, flattened twice and scaled, beside the
+ridge response of the classical method: three channels that look much alike in generated and real
+pictures, whatever the display did to the grey values. It is told no pixel size: that is often
+unknown or wrong, so the scale has to be found in the picture. It answers how probably a pixel is
+vessel, how probably catheter, lead or wire, and how long the chord through vessel is there, in
+pixel edges: a vessel's width is in the picture, and a round vessel is as deep as it is wide.
 """
 
 from __future__ import annotations
@@ -20,29 +21,45 @@ from gcar_deploy.config import SEGMENTERS
 from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging import enhance
+from gcar_deploy.imaging.segment import resize
 from gcar_deploy.models import Kind, Session, read_model
 from gcar_deploy.types import Array, Image, Mask
 
 #: sides of the network's input are multiples of this
 STRIDE = 16
+#: a picture is brought to the area of a square with this side, pixels; its longer side has a limit
+SIDE = 352
+_LONGEST = 1024
 #: what the spec of a fitting model says of its input
-INPUT = {"channels": 3, "stride": STRIDE}
+INPUT = {"channels": 3, "stride": STRIDE, "side": SIDE}
 KIND = Kind("segmenter", "segmenter", INPUT)
 #: finding where ``auto`` has no network
 MISSING = f"{KIND.shipped}.onnx is not installed: vessels were found by the classical method alone"
-OUTPUTS = ("probability", "chord")
+OUTPUTS = ("probability", "chord", "device")
 #: the second flattening is this much wider than the first: borders of lung and heart stay
 _WIDER = 4.0
+#: the filters take a pixel of the network for so much: most fields are near 352 times it
+_NOMINAL_MM = 0.5
+#: a picture without noise has no spread: the unit is at least this share of its brightest lines
+_LEAST_UNIT = 0.05
 
 
-def net_input(picture: Image, holes: Mask, pixel_mm: float) -> Array:
-    """Make the network's input from a picture at working size.
+def at_network_size(picture: Image, holes: Mask) -> tuple[Image, Mask]:
+    """Return picture and holes at the size that the network looks at."""
+    rows, columns = picture.shape
+    scale = min(SIDE / float(np.sqrt(rows * columns)), _LONGEST / max(rows, columns))
+    size = (max(STRIDE, round(columns * scale)), max(STRIDE, round(rows * scale)))
+    work = resize(enhance.fill_holes(picture, holes), size)
+    return work, resize(holes.astype(np.float32), size) > 0.1
+
+
+def net_input(picture: Image, holes: Mask) -> Array:
+    """Make the network's input from a picture at the network's size.
 
     Parameters
     ----------
     picture : (rows, cols) float32, vessels bright
     holes : (rows, cols) bool, pixels without picture
-    pixel_mm : float, pixel size at the isocentre
 
     Returns
     -------
@@ -52,14 +69,14 @@ def net_input(picture: Image, holes: Mask, pixel_mm: float) -> Array:
         0 where there is no picture. A gain or an offset of ``picture`` changes nothing.
     """
     filled = enhance.fill_holes(picture, holes)
-    sigma = enhance.FLATTEN_SIGMA_MM / pixel_mm
+    sigma = enhance.FLATTEN_SIGMA_MM / _NOMINAL_MM
     flat = enhance.flatten(filled, sigma)
-    response = np.where(holes, np.float32(0), enhance.ridges(flat, pixel_mm).response)
+    response = np.where(holes, np.float32(0), enhance.ridges(flat, _NOMINAL_MM).response)
     inside = ~holes if not holes.all() else np.ones_like(holes)
-    low, middle = np.percentile(flat[inside], [16, 50])
+    low, middle, bright = np.percentile(flat[inside], [16, 50, 99.5])
     top = float(np.percentile(response[inside], 99))
     # Vessels are in the upper tail: the spread is that of what lies below the median.
-    scale = np.float32(max(float(middle - low), 1e-9))
+    scale = np.float32(max(float(middle - low), _LEAST_UNIT * float(bright - middle), 1e-9))
     near = np.arcsinh((flat - np.float32(middle)) / scale)
     wide = enhance.flatten(filled, _WIDER * sigma)
     far = np.arcsinh((wide - np.float32(np.median(wide[inside]))) / scale)
@@ -77,10 +94,12 @@ class Seen:
     ----------
     probability : (rows, cols) float32, 0 .. 1, that the pixel is coronary vessel
     chord : (rows, cols) float32, >= 0, through vessel along the pixel's ray, pixel edges
+    device : (rows, cols) float32, 0 .. 1, that the pixel is catheter, lead or wire
     """
 
     probability: Image
     chord: Image
+    device: Image
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""A small 2D U-Net (Ronneberger et al. 2015) for vessel masks and chords through vessels."""
+"""A small 2D U-Net (Ronneberger et al. 2015) for vessels, chords through them, and devices."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class _Pair(nn.Sequential):
 
 
 class MaskUNet(nn.Module):
-    """(n, channels, rows, cols) to (n, 2, rows, cols): vessel logits and chords in pixel edges.
+    """(n, channels, rows, cols) to (n, 3, rows, cols): logits of vessel, chords, logits of device.
 
-    Sides are divisible by 16.
+    Chords are in pixel edges, sides divisible by 16.
     """
 
     def __init__(self, config: MaskUNetConfig | None = None) -> None:
@@ -49,11 +49,11 @@ class MaskUNet(nn.Module):
         self.up = nn.ModuleList(
             _Pair(a + b, b) for a, b in zip(width[:0:-1], width[-2::-1], strict=True)
         )
-        self.head = nn.Conv2d(width[0], 2, 1)
+        self.head = nn.Conv2d(width[0], 3, 1)
         nn.init.constant_(self.head.bias, -2.5)  # vessels are some 7 % of a picture
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return logits and chords."""
+        """Return logits of vessel, chords, and logits of catheter, lead or wire."""
         kept = []
         for k, level in enumerate(self.down):
             x = level(x if k == 0 else functional.max_pool2d(x, 2))
@@ -62,6 +62,6 @@ class MaskUNet(nn.Module):
             finer = kept[-2 - k]
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = level(torch.cat([x, finer], dim=1))
-        logit, chord = self.head(x).split(1, dim=1)
+        logit, chord, device = self.head(x).split(1, dim=1)
         # Chords are up to 30 pixels: the head need not grow that large itself.
-        return torch.cat([logit, CHORD_SCALE * functional.softplus(chord)], dim=1)
+        return torch.cat([logit, CHORD_SCALE * functional.softplus(chord), device], dim=1)
