@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import INPUT, KIND, OUTPUTS, STRIDE, open_segmenter
+from gcar_deploy.imaging.net import INPUT, KIND, OUTPUTS, STRIDE, Segmenter, open_segmenter
+from gcar_deploy.models import Session
+from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
@@ -68,6 +71,22 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
     data = load_file(path)
     net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
     return net.eval()
+
+
+class _CheckpointSession:
+    """Answers as ``models.Session`` does, from a checkpoint that was not exported."""
+
+    def __init__(self, checkpoint: Path) -> None:
+        self.net = _Deployed(load_segmenter_checkpoint(checkpoint)).eval()
+
+    def run(self, inputs: Mapping[str, Array], *_: object, **__: object) -> list[Array]:
+        with torch.no_grad():
+            return [m.numpy() for m in self.net(torch.from_numpy(inputs["channels"]))]
+
+
+def checkpoint_segmenter(checkpoint: Path) -> Segmenter:
+    """Open a checkpoint as if it were a model, for looking at it."""
+    return Segmenter(cast(Session, _CheckpointSession(checkpoint)))
 
 
 def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--segmenter", choices=("classic", "net", "auto"), default="auto")
     parser.add_argument(
         "--model", type=Path, action="append",
-        help="ONNX file; by default the shipped one; several: one per fold, in their order",
+        help="ONNX file or checkpoint, by default the shipped one; several: one per fold, in order",
     )  # fmt: skip
     parser.add_argument("--pixel-mm", type=float, help="taken for the expert-masked pictures' size")
     parser.add_argument("--page", type=Path, help="HTML file with what was found in each picture")
@@ -101,6 +101,10 @@ def find(data: Path, name: str) -> Path:
 
 def network(path: Path | None) -> Segmenter:
     """Load the segmentation network from a file, or the one that comes along."""
+    if path is not None and path.suffix == ".safetensors":
+        from gcar_export.shipping.export_segmenter import checkpoint_segmenter
+
+        return checkpoint_segmenter(path)
     if path is not None:
         return open_segmenter(path, threads=1)
     found = load_segmenter("net", 1)

@@ -109,8 +109,8 @@ class VesselImage:
     path_error : float
         Relative standard deviation of a path; 0 only for ``path_length`` pictures, whose scale
         was given: these are ``calibrated``.
-    alone : VesselImage or None
-        What the network alone sees, where this is a fusion of it with another method.
+    others : tuple of VesselImage
+        What each method alone sees, where this is a fusion of several.
     mask, skeleton, valid : (rows, cols) bool
         Vessel as an observer draws it, at times less than ``path_mm`` covers; its
         one-pixel-wide centreline; pixels that carry a picture (no collimator).
@@ -135,7 +135,7 @@ class VesselImage:
     vesselness: Image | None = None
     catheter: Mask | None = None
     catheter_mm: float = 0.0
-    alone: VesselImage | None = None
+    others: tuple[VesselImage, ...] = ()
 
     def __post_init__(self) -> None:
         for array in (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter):

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 
-import cv2
 import numpy as np
 
-from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.types import Mask
 
 
 def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
-    """Return the mean of both paths, and the lines that both follow.
+    """Return the mean of both paths, and the mask that the network draws.
 
     Their errors have little in common: the one follows any line, however faint, and its contrast
-    holds all that lies there; the other knows what a vessel looks like and is coarse. The classical
-    paths are first brought to the scale of the network's, which is the better known.
+    holds all that lies there; the other knows what a vessel looks like, at whatever size. The
+    classical paths are first brought to the scale of the network's, which is the better known.
 
     Parameters
     ----------
@@ -25,29 +23,19 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
 
     Returns
     -------
-    VesselImage ; its ``alone`` is ``learned``
+    VesselImage ; its ``others`` are ``learned`` and ``classic``
     """
     ours, theirs = classic.path_mm.astype(np.float64), learned.path_mm.astype(np.float64)
     both = (ours > 0) & (theirs > 0)
     power = float((ours[both] ** 2).sum())
     scale = float((ours[both] * theirs[both]).sum()) / power if power > 0 else 1.0
-    mask = _drawn(classic, learned)
     return dataclasses.replace(
         learned,
         path_mm=(0.5 * (scale * ours + theirs)).astype(np.float32),
-        mask=mask,
-        skeleton=skel.skeletonize(mask),
-        alone=learned,
-        catheter=_either(classic, learned, mask),
+        others=(learned, classic),
+        catheter=_either(classic, learned, learned.mask),
         catheter_mm=max(classic.catheter_mm, learned.catheter_mm),
     )
-
-
-def _drawn(classic: VesselImage, learned: VesselImage) -> Mask:
-    """Classical rims along the lines that the network follows too; its own where there are none."""
-    near = cv2.dilate((learned.path_mm > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    followed = skel.beside(classic.mask, classic.skeleton, classic.skeleton & near)
-    return followed if followed.any() else learned.mask
 
 
 def _either(classic: VesselImage, learned: VesselImage, mask: Mask) -> Mask:

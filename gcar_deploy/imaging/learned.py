@@ -19,14 +19,19 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.net import Seen, Segmenter, at_network_size, net_input
 from gcar_deploy.types import Image, Mask
 
-#: hysteresis on the network's probability, for paths and for the mask: a path where there is none
-#: costs less than one that is missing
-PATH_LEVELS = (0.3, 0.6)
-MASK_LEVELS = (0.5, 0.8)
+#: hysteresis on the network's probability: what is faint counts where it touches what is sure
+LEVELS = (0.15, 0.5)
 #: a side branch shorter than this is a spur, pixels of the network
 SPUR_PX = 12
 #: an end of a branch shallower than this share of the main vessels is a twig
-TWIG_SHARE = 0.15
+TWIG_SHARE = 0.05
+#: rim of the mask, as a share of the path in the middle: between the shadow and what experts draw
+RIM_SHARE = 0.5
+#: a line whose contrast is less than this share of what its chord would give is none
+CONTRAST_SHARE = 0.1
+#: paths are averaged over so much of the line before they say where the rim is, and blurred by so
+#: much, pixels of the network
+_ALONG_PX, _BLUR_PX = 3.0, 0.7
 #: hysteresis on the probability of a device, and how long one is at least, pixels of the network
 DEVICE_LEVELS = (0.5, 0.8)
 DEVICE_PX = 30
@@ -52,39 +57,35 @@ def learned_vessels(
     Returns
     -------
     found : Segmentation, at the picture's own size
-        The mask is where the network says vessel; its ``vesselness`` is the probability. Nothing
-        of it depends on ``pixel_mm``.
+        The mask ends at a share of the path in the middle; its ``vesselness`` is the network's
+        probability. Where vessels are does not depend on ``pixel_mm``.
     path_mm : (rows, cols) float32
         Length of the ray within vessel, 0 away from vessels; it reaches beyond the mask.
     """
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
     seen = segmenter.look(net_input(work, work_holes))
-    seen = dataclasses.replace(
-        seen, probability=np.where(work_holes, np.float32(0), seen.probability)
-    )
+    other = work_holes | (seen.device > seen.probability)
+    seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]
-    work_mm = np.float32(pixel_mm * np.sqrt(search.size / work.size))
-    reach = support(seen, PATH_LEVELS)
-    near = (segment.resize(reach.astype(np.float32), full) >= 0.5) & ~holes
-    sure = support(seen, MASK_LEVELS)
-    around = cv2.dilate(sure.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
-    probability = np.where(holes, np.float32(0), segment.resize(seen.probability, full))
-    # The rim is where the answer crosses one half: between the network's own pixels.
-    mask = (probability >= 0.5) & (segment.resize(around, full) >= 0.5)
-    mask |= (segment.resize(sure.astype(np.float32), full) >= 0.5) & ~holes
-    near |= mask
+    finer = float(np.sqrt(search.size / work.size))
+    work_mm = np.float32(pixel_mm * finer)
+    sure = support(seen, LEVELS)
+    near = (segment.resize(sure.astype(np.float32), full) >= 0.5) & ~holes
     chord = np.where(near, segment.resize(seen.chord, full) * work_mm, np.float32(0))
     laws = {name: picture for name, picture in pictures.items() if name != "search"}
     contrast = _scaled_contrast(laws, holes, near, chord, pixel_mm)
+    near = _with_contrast(near, chord, contrast, finer)
+    path = np.where(near, 0.5 * (chord + contrast), 0).astype(np.float32)
+    mask = _drawn(path, near, finer)
     device = _devices(seen, sure)
     found = dataclasses.replace(
         segment.given(search, mask, holes, pixel_mm),
-        vesselness=probability,
+        vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
         catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~mask,
         catheter_mm=int(skel.skeletonize(device).sum()) * float(work_mm),
     )
-    return found, np.asarray(0.5 * (chord + contrast), dtype=np.float32)
+    return found, path
 
 
 def support(seen: Seen, levels: tuple[float, float]) -> Mask:
@@ -143,3 +144,26 @@ def _scaled_contrast(
             scale = np.float32((c * q).sum() / (c * c).sum())
             best, agreement = np.where(near, rise * scale, np.float32(0)), alike
     return best if agreement > -np.inf else chord
+
+
+def _with_contrast(near: Mask, chord: Image, contrast: Image, finer: float) -> Mask:
+    """(rows, cols) bool: lines without those that nothing of the picture speaks for."""
+    line = skel.skeletonize(near)
+    if not line.any():
+        return near
+    _, (deep, rise) = skel.spread(line, (chord, contrast), _ALONG_PX * finer)
+    return skel.beside(near, line, line & (rise >= CONTRAST_SHARE * deep))
+
+
+def _drawn(path: Image, near: Mask, finer: float) -> Mask:
+    """(rows, cols) bool: where the rims are, and no thinner than a line.
+
+    ``finer``: pixels of the picture for one of the network.
+    """
+    line = skel.skeletonize(near)
+    if not line.any():
+        return line
+    line = skel.prune(line, path, SPUR_PX * finer, 0.0)
+    smooth = cv2.GaussianBlur(path, (0, 0), _BLUR_PX * max(1.0, finer))
+    _, (peak,) = skel.spread(line, (smooth,), _ALONG_PX * finer)
+    return ((smooth > RIM_SHARE * peak) | line) & near

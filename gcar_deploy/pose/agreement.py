@@ -69,14 +69,17 @@ def _alone_if_closer(
     poses = poses_between(views, options)
     worst = max(p.after for p in poses)
     limits = options.quality
-    if worst <= limits.alone_disagreement_raw or all(view.alone is None for view in views):
+    if worst <= limits.alone_disagreement_raw:
         return views, poses
-    alone = [view if view.alone is None else view.alone for view in views]
-    closer = poses_between(alone, options)
-    if limits.alone_ratio * max(p.after for p in closer) >= worst:
-        return views, poses
-    _log.info("the views agree better by what the network alone sees")
-    return alone, closer
+    fusions = views
+    for k in range(max(len(view.others) for view in fusions)):
+        alone = [view.others[k] if k < len(view.others) else view for view in fusions]
+        closer = poses_between(alone, options)
+        after = max(p.after for p in closer)
+        if limits.alone_ratio * after < worst:
+            _log.info("the views agree better by what method %d of the fusion alone sees", k + 1)
+            views, poses, worst = alone, closer, after
+    return views, poses
 
 
 def poses_between(
