@@ -138,8 +138,8 @@ def false_lesions(count: int, on_case: Callable[[], None] | None = None) -> tupl
             result = engine.reconstruct(angiograms, grid)
         except GcarError:
             continue
-        stated = [m.stenosis_percent for m in result.measured.lumens]
-        stated = [percent for percent in stated if percent is not None]
+        found = [m.stenosis_percent for m in result.measured.lumens]
+        stated = [percent for percent in found if percent is not None]
         vessels += len(stated)
         seen += sum(percent >= 100 * LESION_SHARE for percent in stated)
         if on_case is not None:

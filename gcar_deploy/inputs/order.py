@@ -329,7 +329,6 @@ def _lesions(key: str, value: Any) -> tuple[LesionBorders, ...]:
     return tuple(out)
 
 
-
 def _frames(key: str, value: Any) -> tuple[int | None, ...]:
     entries = _list(key, value, "frames")
     return tuple(None if frame is None else whole(key, frame) for frame in entries)

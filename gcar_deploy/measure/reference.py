@@ -49,9 +49,9 @@ def reference_lines(
     count = len(tree.branches)
     if not count:
         return ()
-    level = np.array([_usual(own, use) for own, use in zip(sections, clear, strict=True)])
-    slope = TAPER * level
-    middle = np.array([0.5 * own.arc_mm[-1] for own in sections])
+    level: Scalars = np.array([_usual(own, use) for own, use in zip(sections, clear, strict=True)])
+    slope: Scalars = TAPER * level
+    middle: Scalars = np.array([0.5 * own.arc_mm[-1] for own in sections])
     scatter = SCATTER[1]
     wholes = [_spans(own.arc_mm)[use] / ROUGH_MM for own, use in zip(sections, clear, strict=True)]
     for number in range(_FIRST + _ROUNDS):
@@ -75,8 +75,8 @@ def reference_lines(
             H[count + k, count + k] += tilted @ off
             pull[k] += weight @ diameter
             pull[count + k] += tilted @ diameter
-        found = np.linalg.solve(H, pull)
-        level = np.maximum(found[:count], _LEAST_MM).astype(np.float64)
+        found = np.asarray(np.linalg.solve(H, pull), dtype=np.float64)
+        level = np.asarray(np.maximum(found[:count], _LEAST_MM), dtype=np.float64)
         slope = found[count:]
         if number >= _FIRST - 1:
             scatter = _scatter(np.concatenate(left))
