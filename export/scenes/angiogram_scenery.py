@@ -90,9 +90,9 @@ def _devices(rng: np.random.Generator, side: int, pixel_mm: float) -> Image:
         at, way = rng.uniform(0, side, 2), rng.normal(0, 2.5 / pixel_mm, 2)
         _stroke(out, [at, at + way], 1.0 / pixel_mm, rng.uniform(0.3, 1.0))
     if rng.random() < 0.1:  # sternal wires
-        at = rng.uniform(0, side)
+        column = rng.uniform(0, side)
         for row in np.arange(rng.uniform(0, 40), side, rng.uniform(40, 80)):
-            turn = rng.uniform(-9, 9, (4, 2)) + np.array([at, row])
+            turn = rng.uniform(-9, 9, (4, 2)) + np.array([column, row])
             _stroke(out, [*turn, turn[0]], 0.9 / pixel_mm, 0.7)
     for _ in range(rng.poisson(0.15)):  # electrodes
         center = tuple(int(x) for x in rng.uniform(0, side, 2))

@@ -98,7 +98,7 @@ def expert_pair(pictures: Sequence[ExpertPicture], seed: int, index: int) -> tup
         cv2.warpAffine(np.asarray(a, np.float32), move, size, flags=cv2.INTER_LINEAR)
         for a in (chosen.mask, chosen.path_px * np.float32(zoom), np.ones_like(chosen.pixels))
     )
-    channels, holes = network_input(_regraded(rng, pixels))
+    channels, holes = network_input(_regraded(rng, np.asarray(pixels, np.float32)))
     asked = (inside > 0.99) & ~holes
     truth = np.stack([mask >= 0.5, asked, path * asked, 0 * path, 0 * path])
     return channels, np.ascontiguousarray(truth, dtype=np.float32)

@@ -155,7 +155,8 @@ def main() -> None:
         "hidden": np.round(usual.hidden, 4).tolist(), "out": np.round(usual.out, 4).tolist(),
     }  # fmt: skip
     told.out.write_text(json.dumps(held) + "\n", encoding="utf-8")
-    kept = Usual(*(np.array(held[key]) for key in ("scale", "hidden", "out")), lines)
+    scale, hidden, weights = (np.array(held[key]) for key in ("scale", "hidden", "out"))
+    kept = Usual(scale, hidden, weights, lines)
     print(table(kept, *figures_of(CHECK_SEED, told.judge)))
 
 

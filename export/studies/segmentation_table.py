@@ -198,7 +198,7 @@ def _print_expert(rows: Mapping[str, Mapping[str, float]], each: bool, asked: As
     print("|---" * (len(names) + 1) + "|")
     if each:
         for picture, scores in rows.items():
-            print(_line(picture, scores))
+            print(_line(picture, dict(scores)))
     for label, reduce in (("mean", np.mean), ("worst", np.min)):
         reduced = {n: float(reduce([r[n] for r in rows.values()])) for n in names}
         print(_line(label, reduced))

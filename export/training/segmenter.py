@@ -225,7 +225,9 @@ def train(
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
     real = real_pictures(options)
-    net = MaskUNet(MaskUNetConfig()).to(options.device, memory_format=torch.channels_last).train()
+    net = MaskUNet(MaskUNetConfig()).to(options.device).train()
+    # channels_last only orders the memory; the stubs of Module.to do not know it
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if begin_from is not None:
         net.load_state_dict(_weights(load_file(begin_from)))
     optimiser = torch.optim.AdamW(

@@ -51,5 +51,5 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
         mask=mask,
         skeleton=line,
         path_mm=np.asarray(path, dtype=np.float32),
-        alone=None if found.alone is None else edited(found.alone, angiogram),
+        others=tuple(edited(other, angiogram) for other in found.others),
     )

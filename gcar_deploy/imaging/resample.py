@@ -42,7 +42,7 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
         catheter = (area_average(catheter.astype(np.float32), rows, columns) >= 0.5) & ~mask
     return dataclasses.replace(
         old,
-        alone=None,
+        others=(),
         carm=old.carm.resized(rows, columns),
         path_mm=path,
         mask=mask,
