@@ -186,8 +186,8 @@ def match_picture(
     ----------
     carm : CArm
     rows, columns : of the picture
-    allow_rescale : whether a picture of another size may be a rescaled one; it may as well be a
-        crop, which nobody can tell from it
+    allow_rescale : whether any other size of the same shape may be a rescaled picture; it may as
+        well be a crop, which nobody can tell from it. Whole multiples and parts need no leave
 
     Returns
     -------
@@ -206,7 +206,8 @@ def match_picture(
             f"rows x columns = {carm.rows} x {carm.columns} is at odds with the picture's "
             f"{rows} x {columns}, which is no exact rescaling"
         )
-    if not allow_rescale:
+    whole = max(rows, carm.rows) % min(rows, carm.rows) == 0
+    if not whole and not allow_rescale:
         raise GeometryError(
             f"rows x columns = {carm.rows} x {carm.columns} is at odds with the picture's "
             f"{rows} x {columns}; allow_rescale (--allow-rescale) takes it for the whole picture "

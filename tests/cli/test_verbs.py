@@ -186,8 +186,8 @@ def test_rescaled_pictures_are_taken_where_that_is_allowed_and_said(good_case, t
     shutil.copytree(good_case, case)
     data = json.loads((case / "geom.json").read_text())
     for view in data["views"]:
-        view["rows"] = view["columns"] = 192
-        view["pixel_spacing_mm"] = [0.8, 0.8]
+        view["rows"] = view["columns"] = 120
+        view["pixel_spacing_mm"] = [1.28, 1.28]
     (case / "geom.json").write_text(json.dumps(data))
     looked = ("validate", case / "view1.png", case / "view2.png", "--geom", case / "geom.json")
     for call in (run_arguments(case, tmp_path / "out"), looked):
@@ -195,7 +195,7 @@ def test_rescaled_pictures_are_taken_where_that_is_allowed_and_said(good_case, t
         assert done.code == 4 and "view 1: rows" in done.err and "--allow-rescale" in done.err
     assert not (tmp_path / "out").exists()
     done = gcar(*run_arguments(case, tmp_path / "out", "--allow-rescale"))
-    assert done.code == 0 and "0.5 times" in done.err
+    assert done.code == 0 and "0.8 times" in done.err
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
