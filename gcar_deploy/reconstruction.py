@@ -26,7 +26,7 @@ from gcar_deploy.geometry.observability import (
 )
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.measure import BranchName, Measured, Sections, measured
-from gcar_deploy.measure.lumen import BranchLumen
+from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
 from gcar_deploy.quality import Quality, part_lengths_mm, unexplained
@@ -122,7 +122,8 @@ class Reconstruction:
         ghosts = {ghost.branch: ghost.probability for ghost in found}
         doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches), ghosts)
         names = [None if name is None else name.name for name in self.names]
-        return pressure_drop(self.tree, self.measured.lumens, doubts=doubts, names=names)
+        # From the radii alone, as ``gcar flow`` has them from the folder.
+        return pressure_drop(self.tree, tree_lumens(self.tree), doubts=doubts, names=names)
 
     @functools.cached_property
     def unexplained(self) -> tuple[Mask, ...]:

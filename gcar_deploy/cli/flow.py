@@ -70,7 +70,7 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
       gcar flow result --out model
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.flow import doubts_of, pressure_drop, pressure_table
-    from gcar_deploy.measure.lumen import branch_lumen
+    from gcar_deploy.measure.lumen import tree_lumens
     from gcar_deploy.output.folder import check_target
     from gcar_deploy.output.stored import read_folder
 
@@ -82,8 +82,7 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
     ghosts = {ghost["branch"] - 1: ghost["probability"] for ghost in found}
     doubts = doubts_of(told["status"], told["sentence"], len(tree.branches), ghosts)
     names = [branch.get("name") for branch in told["tree"]["branches"]]
-    lumens = [branch_lumen(branch) for branch in tree.branches]
-    drop = pressure_drop(tree, lumens, assumed, doubts, names)
+    drop = pressure_drop(tree, tree_lumens(tree), assumed, doubts, names)
     table = pressure_table(drop)
     if out is not None:
         from gcar_deploy.output.handover import write_handover

@@ -72,7 +72,10 @@ def asked(
     out = []
     for k, own in enumerate(poses):
         fixed, moving = masses[own.partner], masses[k]
-        if own.partner == k or fixed is None or moving is None:
+        # Where less differs than a correction must win, nothing can be asked for.
+        if own.partner == k or own.before <= options.quality.asked_least:
+            continue
+        if fixed is None or moving is None:
             continue
         placed = dataclasses.replace(fixed, carm=poses[own.partner].applied(fixed.carm))
         if separation_deg(placed.carm, moving.carm) < MOST_APART_DEG:

@@ -18,6 +18,7 @@ from gcar_deploy.measure.lumen import hidden_share
 from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
 from gcar_deploy.quality.anatomy import check_anatomy
+from gcar_deploy.quality.border import check_border
 from gcar_deploy.quality.gates import best_separation, disagreement_limits, kind_of
 from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.human_range import check_human_range
@@ -128,7 +129,7 @@ def judge(
     findings = [
         *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
         *check_human_range(tree), *check_ghosts(ghosts, options.quality),
-        *check_anatomy(tree, [view.carm for view in views]),
+        *check_anatomy(tree, [view.carm for view in views]), *check_border(tree, views),
     ]  # fmt: skip
     lumen = [_lumen(tree, v.carm) for v in views]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)

@@ -266,7 +266,7 @@ MUTANTS = (
     Mutant(
         "views: pictures in the wrong order are not noticed",
         "gcar_deploy/pose/agreement.py",
-        "    return check_order(ids, given, other, kind, options.quality)",
+        "    return check_order(ids, given, orders[i, j], kind_of(views), options.quality)",
         '    return [], ""',
         ("tests/hard/test_matrix.py::test_swapped_pictures_are_asked_for_by_name",),
     ),
@@ -294,8 +294,8 @@ MUTANTS = (
     Mutant(
         "names: the ostium that anatomy names is not the inlet",
         "gcar_deploy/measure/inlet.py",
-        "if node in named] or",
-        "if node in ()] or",
+        "for wanted in (marked, named, free))",
+        "for wanted in (marked, (), free))",
         ("tests/measure/test_inlet.py",),
     ),
     Mutant(

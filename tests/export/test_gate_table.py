@@ -125,7 +125,8 @@ def test_replayed_gates_are_those_of_the_engine(subjects, kind, pictures):
         result = Engine(threads=1).reconstruct(pair.angiograms, case_geometry("clinical", 2)[1])
     except RefusedError as error:
         assert replayed(found, GATES) == "refused"
-        assert ("swapped?" in str(error)) == (kind == "swapped" and pictures == "path length")
+        assert kind == "swapped" or "swapped?" not in str(error)
+        assert "swapped?" in str(error) or kind != "swapped" or pictures != "path length"
     else:
         assert replayed(found, GATES) == result.status
         assert kind == "same" or result.status == "degraded"

@@ -245,9 +245,9 @@ def clutter():
     for name, add, allowed in (
         ("catheter", wire, NOT_OK),
         ("gradient", lambda g: g * (0.5 + 0.5 * cols / SIDE), DONE),
-        ("spine", lambda g: g - 40 * np.exp(-(((cols - 40) / 12.0) ** 2)), NOT_OK),
+        ("spine", lambda g: g - 40 * np.exp(-(((cols - 40) / 12.0) ** 2)), DONE),
         ("diaphragm", lambda g: g - 50 / (1 + np.exp(-(rows - 90 + 0.2 * cols) / 2.0)), DONE),
-        ("text", text, NOT_OK),
+        ("text", text, DONE),
         ("collimator", collimator, DONE),
     ):
         truth = TREE if allowed == DONE else None

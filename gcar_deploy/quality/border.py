@@ -1,0 +1,57 @@
+"""Lines that run out of a grey picture: catheters come from its border, vessels rarely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Array
+
+#: a free end so near to where the picture ends is cut by it, mm at the isocentre
+BORDER_MM = 2.0
+#: shorter branches are left alone, mm
+LEAST_MM = 20.0
+
+
+def check_border(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
+    """Doubt long branches that end where a grey picture ends.
+
+    A catheter that the segmentation took for vessel is explained by the tree like any vessel, and
+    all views agree on it; that it comes from the border tells it apart. Masks and calibrated
+    pictures hold what their maker let in, so that only vessels can be cut there.
+
+    Parameters
+    ----------
+    tree : Tree
+    views : the pictures that it was made from
+    """
+    grey = [view for view in views if not view.calibrated and view.kind != "mask"]
+    meeting = tree.degrees
+    for number, branch in enumerate(tree.branches, start=1):
+        ends = [n for n in (branch.start, branch.end) if meeting[n] == 1]
+        if branch.length_mm < LEAST_MM or not ends:
+            continue
+        for view in grey:
+            if _distance_mm(view, tree.nodes_mm[ends]).min() < BORDER_MM:
+                return [
+                    f"branch {number} runs out of view {view.view_id}: a catheter or lead, or a "
+                    "vessel that is cut there?"
+                ]
+    return []
+
+
+def _distance_mm(view: VesselImage, points_mm: Array) -> Array:
+    """(n,) distance of points from where the picture ends, mm at the isocentre; 0 outside."""
+    inside = np.pad(view.valid.astype(np.uint8), 1)
+    away = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    pixels = np.rint(np.nan_to_num(view.carm.project(points_mm)[0], nan=-9.0)).astype(np.int64) + 1
+    column, row = pixels[:, 0], pixels[:, 1]
+    rows, columns = inside.shape
+    seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    found = away[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+    out: Array = np.where(seen, found, 0.0) * view.carm.pixel_at_isocenter_mm
+    return out
