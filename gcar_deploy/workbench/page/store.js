@@ -8,7 +8,7 @@ const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 export class Store extends EventTarget {
   info = null; result = null; job = null; running = false;
-  chosen = 0; cursor = null; ran = null; #past = []; #future = []; #runs = 0;
+  chosen = 0; cursor = null; ran = null; #past = []; #future = []; #runs = 0; #last = Promise.resolve();
 
   get path() { return `/api/cases/${this.info.id}`; }
   get now() { return corrections(this.info.order); }
@@ -22,29 +22,41 @@ export class Store extends EventTarget {
   open(info) {
     this.#runs++; this.running = false;
     Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null });
-    this.#past = []; this.#future = [];
+    this.#past.length = 0; this.#future.length = 0;
     this.tell("opened");
   }
 
   /** Change corrections; what comes of it can be undone. */
-  async change(values) {
-    const before = this.now;
-    await this.#send({ ...before, ...values });
-    this.#past.push(before); this.#future = [];
-    this.tell("changed");
+  change(values) {
+    return this.#inTurn(async () => {
+      const before = this.now;
+      await this.#send({ ...before, ...values });
+      this.#past.push(before); this.#future.length = 0;
+      this.tell("changed");
+    });
+  }
+
+  /** One change after the other: a second undo must not find the first half done. */
+  #inTurn(work) {
+    const own = this.#last.then(work);
+    this.#last = own.catch(() => {});
+    return own;
   }
 
   async undo() { await this.#step(this.#past, this.#future); }
   async redo() { await this.#step(this.#future, this.#past); }
 
   async #step(from, to) {
-    if (!from.length) return;
-    const before = this.now, after = from.at(-1);
-    await this.#send(after);
-    from.pop(); to.push(before);
-    this.tell("changed");
+    const again = await this.#inTurn(async () => {
+      if (!from.length) return false;
+      const before = this.now, after = from.at(-1);
+      await this.#send(after);
+      from.pop(); to.push(before);
+      this.tell("changed");
+      return !same(before.deleted_mm, after.deleted_mm) || !same(before.ostia, after.ostia);
+    });
     // Only a new run shows what becomes of a tree; strokes are seen at once.
-    if (!same(before.deleted_mm, after.deleted_mm) || !same(before.ostia, after.ostia)) await this.run();
+    if (again) await this.run();
   }
 
   async #send(values) {
