@@ -36,6 +36,12 @@ from gcar_export.training.run_folder import load_weights
 from gcar_export.training.scene_stream import in_order
 
 
+@pytest.fixture(autouse=True, scope="module")
+def usual_threads():
+    """Blurs differ in the last bit by the number of threads, which other tests set."""
+    cv2.setNumThreads(-1)
+
+
 @pytest.fixture(scope="module")
 def scenes():
     return [training_scene(7, i) for i in range(3)]
@@ -200,12 +206,6 @@ def test_a_warm_start_of_another_size_is_refused(tmp_path):
         train(
             tmp_path, PRESETS["tiny"], TINY, until=0.0, warm_start=shipped_model_path("gcp-multi")
         )
-
-
-@pytest.fixture(autouse=True)
-def usual_threads():
-    """Blurs differ in the last bit by the number of threads, which other tests set."""
-    cv2.setNumThreads(-1)
 
 
 def test_scenes_drawn_ahead_are_those_drawn_here():
