@@ -89,6 +89,33 @@ def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tup
     return out[0] / sums[0], out[1] / sums[1]
 
 
+def uncovered_mm(fixed: Mass, moving: Mass, carm: CArm) -> float:
+    """Length across the epipolar planes that one view shows vessel on and the other does not, mm.
+
+    Of outlines that touch the same planes it is zero, however vessels overlap within them
+    (silhouette coherence, Hernandez et al., IEEE PAMI 29 (2007) 343).
+
+    Parameters
+    ----------
+    fixed, moving, carm : as of ``mass_profiles``
+    """
+    base = carm.source_mm - fixed.carm.source_mm
+    lever = np.linalg.norm(np.cross(fixed.carm.source_mm, carm.source_mm)) / np.linalg.norm(base)
+    covered = []
+    for mass, view in ((fixed, fixed.carm), (moving, carm)):
+        at = plane_angles(fixed.carm, carm, view, mass.pixels) * lever / BIN_MM + HALF_BINS
+        # A pixel covers all bins up to half its diagonal from its middle.
+        half = np.sqrt(0.5) * view.pixel_at_isocenter_mm / BIN_MM
+        low, high = (
+            np.clip(np.rint(at + part).astype(np.int64), 0, 2 * HALF_BINS + 1)
+            for part in (-half, half)
+        )
+        n = 2 * HALF_BINS + 2
+        open_pixels = np.cumsum(np.bincount(low, minlength=n) - np.bincount(high, minlength=n))
+        covered.append(open_pixels > 0)
+    return BIN_MM * float(np.logical_xor(*covered).sum())
+
+
 def match_rate(first: CArm, second: CArm, a: Pixels, b: Pixels, near_mm: float) -> float | None:
     """Share of the first view's vessel pixels with a possible partner in the second.
 

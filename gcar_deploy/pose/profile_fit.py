@@ -31,7 +31,9 @@ MASK_NOISE = 0.1
 #: directions further apart than this are not compared: see ``estimate_poses``
 MOST_APART_DEG = 150.0
 #: a correction must lower the disagreement to this share of what it was
-MIN_GAIN, MASK_MIN_GAIN = 0.85, 0.8
+MIN_GAIN, MASK_MIN_GAIN = 0.85, 0.9
+#: and, of masks, leave no more than this share of what only one of them covers
+MASK_UNCOVERED = 0.75
 #: looks at the profiles after which a fit stops where it is: more than pairs of one tree need
 MAX_EVALUATIONS = 120
 #: relative change of the objective or of the pose below which a fit ends

@@ -11,6 +11,7 @@ from gcar_deploy.geometry.consistency import (
     mass_profiles,
     match_rate,
     mismatch,
+    uncovered_mm,
     vessel_mass,
 )
 from gcar_deploy.geometry.epipolar import plane_angles, plane_normal
@@ -107,6 +108,19 @@ def test_only_motion_across_the_planes_shows():
     values = [disagreement(*across, PAIR[1].moved(s * normal), 0.5) for s in steps]
     assert steps[int(np.argmin(values))] == 4.0
     assert min(values) < 0.03
+
+
+@pytest.mark.parametrize("shift", [0.0, 2.0, -3.5])
+def test_uncovered_length_is_twice_the_motion_of_one_bar_whatever_stands_behind_it(shift):
+    """Of a bar moved along itself each end leaves ``shift`` mm that one view alone covers."""
+    normal = plane_normal(*PAIR)
+    steps = np.linspace(-20, 20, 161)[:, None]
+    bar = steps * normal
+    behind = bar[40:120] + 9 * PAIR[0].axes[2]  # hidden in the first view, beside it in the second
+    both = np.concatenate([bar, behind])
+    fixed, moving = masses(both, both + shift * normal)
+    assert uncovered_mm(fixed, moving, PAIR[1]) == pytest.approx(2 * abs(shift), abs=0.75)
+    assert uncovered_mm(fixed, moving, PAIR[1].moved(shift * normal)) <= 0.75
 
 
 def test_no_vessel_is_none():

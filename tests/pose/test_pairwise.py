@@ -59,8 +59,9 @@ def as_masks(views):
     return [(c, mask_path(path > 0, c.pixel_at_isocenter_mm)) for c, path in views]
 
 
-@pytest.mark.parametrize("seed", [11, 12, 13, 14])
+@pytest.mark.parametrize("seed", [11, 12, 22, 34])
 def test_masks_as_placed_are_left_alone(seed):
+    """The profiles alone would move the last two, by 10 and by 3 mm, for what overlaps in them."""
     views = as_masks(pictures(seed=seed))
     pose = estimate_poses(views, PoseOptions(), masks=(True, True))[1]
     assert pose.before > 0.03, "overlaps make the profiles of masks differ"
