@@ -31,12 +31,12 @@ from gcar_deploy.pose.joint import corrected, estimate_jointly
 from gcar_deploy.pose.profile_fit import (
     MASK_MIN_GAIN,
     MASK_NOISE,
-    MASK_UNCOVERED,
     MIN_GAIN,
     MOST_APART_DEG,
     PROFILE_NOISE,
     SEARCH_MM,
     STEP_MM,
+    covers,
     fit_profiles,
     prior_root,
     prior_sigmas,
@@ -249,7 +249,8 @@ def _estimate(
     )
     marked = gap is not None and gap_after is not None
     better = marked and (gap_after or 0.0) < MIN_GAIN * (gap or 0.0)
-    if not better and (after > most_left * before or not _covered(fixed, moving, carm)):
+    covered = covers(fixed, moving, carm, uncovered_mm(fixed, moving, moving.carm))
+    if not better and (after > most_left * before or not covered):
         # Not clearly better than the geometry as given: leave it alone.
         return given
     x, y, z, primary, secondary = (float(value) for value in start)
@@ -263,19 +264,6 @@ def _estimate(
         landmark_after_mm=gap_after,
         converged=converged,
     )
-
-
-def _covered(fixed: Mass, moving: Mass, carm: CArm) -> bool:
-    """Whether a correction lets both pictures show vessel on the same planes, as it should.
-
-    Where vessels overlap, masks (and saturated pictures) hold less mass than there is, and a move
-    can make the profiles look more alike; which planes hold any vessel knows of no overlap.
-    """
-    if fixed.calibrated and moving.calibrated:
-        return True
-    now = uncovered_mm(fixed, moving, carm)
-    most = MASK_UNCOVERED if fixed.mask or moving.mask else 1.0
-    return now <= most * uncovered_mm(fixed, moving, moving.carm)
 
 
 def _gap_mm(first: CArm, second: CArm, marks: tuple[Pixels, Pixels]) -> float | None:

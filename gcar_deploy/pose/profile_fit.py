@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.consistency import Mass, uncovered_mm
 from gcar_deploy.geometry.prior import ANGLE_DEG, MAGNIFICATION, OFFSET_MM
 from gcar_deploy.types import Array, Scalars
 
@@ -103,6 +104,23 @@ def fit_profiles(
         if error == CALIBRATED_NOISE:
             return x, converged
     return fitted(x, options.fine_mm, max(now, CALIBRATED_NOISE))
+
+
+def covers(fixed: Mass, moving: Mass, carm: CArm, told_mm: float) -> bool:
+    """Whether a correction lets both pictures show vessel on the same planes, as it should.
+
+    Where vessels overlap, masks (and saturated pictures) hold less mass than there is, and a move
+    can make the profiles look more alike; which planes hold any vessel knows of no overlap.
+
+    Parameters
+    ----------
+    fixed, moving, carm : as of ``mass_profiles``, ``carm`` and ``moving`` corrected
+    told_mm : float, what one view alone covered before (``uncovered_mm``)
+    """
+    if fixed.calibrated and moving.calibrated:
+        return True
+    most = MASK_UNCOVERED if fixed.mask or moving.mask else 1.0
+    return uncovered_mm(fixed, moving, carm) <= most * told_mm
 
 
 def prior_sigmas() -> Array:

@@ -16,12 +16,18 @@ from scipy.optimize import least_squares
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
-from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, mismatch
+from gcar_deploy.geometry.consistency import (
+    Mass,
+    disagreement,
+    mass_profiles,
+    mismatch,
+    uncovered_mm,
+)
 from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.agreement import profiled
 from gcar_deploy.pose.pairwise import Pose
-from gcar_deploy.pose.profile_fit import MOST_APART_DEG, SEARCH_MM, STEP_MM
+from gcar_deploy.pose.profile_fit import MOST_APART_DEG, SEARCH_MM, STEP_MM, covers
 from gcar_deploy.types import Array, Scalars
 
 #: fits go so far at most, standard deviations: shift in mm, two angles in deg, log of the scale
@@ -126,6 +132,10 @@ class _Pair:
             ).x
         return whole(y)
 
+    def uncovered_mm(self, x: Array) -> float:
+        """Return what one view alone covers."""
+        return uncovered_mm(self.fixed, *self.changed(x))
+
     def left(self, x: Array) -> tuple[float, float]:
         """Squared difference as a share of the norm, and disagreement."""
         moving, carm = self.changed(x)
@@ -136,9 +146,14 @@ class _Pair:
 
 
 def _asked(view: int, partner: int, pair: _Pair) -> Asked:
-    given = pair.left(pair.fitted(_SHIFT))
+    shift = pair.fitted(_SHIFT)
+    given = pair.left(shift)
     turn, scale = pair.fitted(_TURN), pair.fitted(_SCALE)
-    turned, scaled = pair.left(turn), pair.left(scale)
+    # What does not let both pictures cover the same planes is not what they ask for.
+    told = min(pair.uncovered_mm(np.zeros(4)), pair.uncovered_mm(shift))
+    turned, scaled = (
+        pair.left(x) if covers(pair.fixed, *pair.changed(x), told) else given for x in (turn, scale)
+    )
     return Asked(
         view=view, partner=partner, turn_deg=float(np.abs(turn[1:3]).max()),
         scale=float(np.exp(scale[3])), given=given[1], turned=turned[1], scaled=scaled[1],
