@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.epipolar import triangulate
 from gcar_deploy.geometry.scene import Intensity, Scene, View
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Pixels, Points
@@ -179,13 +180,7 @@ def rays_miss_px(case: Exam, told: Told) -> float:
         move(carm.project(points)[0])
         for carm, move in zip(case.told.carms, told.moves, strict=True)
     ]
-    normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    for carm, at in zip(told.carms, pixels, strict=True):
-        ray = carm.rays(at)
-        across = np.eye(3) - ray[:, :, None] * ray[:, None]
-        normal += across
-        right += across @ carm.source_mm
-    found = np.linalg.solve(normal, right[:, :, None])[:, :, 0].astype(np.float64)
+    found, _ = triangulate(told.carms, pixels)
     gaps = [c.project(found)[0] - at for c, at in zip(told.carms, pixels, strict=True)]
     return float(np.sqrt(np.mean(np.sum(np.square(gaps), axis=2))))
 

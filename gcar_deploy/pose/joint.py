@@ -22,15 +22,13 @@ from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, 
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.geometry.prior import LANDMARK_MM, OFFSET_MM
 from gcar_deploy.pose.profile_fit import (
-    MASK_NOISE,
-    MIN_GAIN,
     MOST_APART_DEG,
-    PROFILE_NOISE,
     SEARCH_MM,
     STEP_MM,
     fit_profiles,
     prior_root,
     prior_sigmas,
+    tolerances,
 )
 from gcar_deploy.types import Array, Scalars
 
@@ -105,7 +103,7 @@ class _Problem:
 
     @property
     def noise(self) -> float:
-        return MASK_NOISE if any(mass.mask for mass in self.seen.values()) else PROFILE_NOISE
+        return tolerances(self.seen.values())[0]
 
     @property
     def prior(self) -> Array:
@@ -208,11 +206,12 @@ class _Problem:
 
     def without_the_needless(self, theta: Array) -> Array:
         """Leave a view alone whose correction does not clearly help it to agree."""
+        _, least_gain = tolerances(self.seen.values())
         for k in range(1, len(theta)):
             less = theta.copy()
             less[k] = 0.0
             alone = self.mean_disagreement(less, k)
-            if self.mean_disagreement(theta, k) > MIN_GAIN * alone:
+            if self.mean_disagreement(theta, k) > least_gain * alone:
                 theta = less
         return theta
 

@@ -29,17 +29,15 @@ from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.geometry.prior import LANDMARK_MM
 from gcar_deploy.pose.joint import corrected, estimate_jointly
 from gcar_deploy.pose.profile_fit import (
-    MASK_MIN_GAIN,
-    MASK_NOISE,
     MIN_GAIN,
     MOST_APART_DEG,
-    PROFILE_NOISE,
     SEARCH_MM,
     STEP_MM,
     covers,
     fit_profiles,
     prior_root,
     prior_sigmas,
+    tolerances,
 )
 from gcar_deploy.types import Array, Image, Pixels
 
@@ -230,8 +228,7 @@ def _estimate(
 
     normal = plane_normal(fixed.carm, moving.carm)
     start, best = np.zeros(5), np.inf
-    mask = fixed.mask or moving.mask
-    noise, most_left = (MASK_NOISE, MASK_MIN_GAIN) if mask else (PROFILE_NOISE, MIN_GAIN)
+    noise, most_left = tolerances((fixed, moving))
     near = calibrated and apart <= noise
     reach = 0.0 if near else SEARCH_MM
     for shift in np.arange(-reach, reach + 1e-9, STEP_MM):

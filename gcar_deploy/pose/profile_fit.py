@@ -9,7 +9,7 @@ together as one measurement: a mismatch of other causes makes the priors strong 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -121,6 +121,12 @@ def covers(fixed: Mass, moving: Mass, carm: CArm, told_mm: float) -> bool:
         return True
     most = MASK_UNCOVERED if fixed.mask or moving.mask else 1.0
     return uncovered_mm(fixed, moving, carm) <= most * told_mm
+
+
+def tolerances(masses: Iterable[Mass]) -> tuple[float, float]:
+    """Error of a profile, and share of the disagreement that a correction must come below."""
+    mask = any(mass.mask for mass in masses)
+    return (MASK_NOISE, MASK_MIN_GAIN) if mask else (PROFILE_NOISE, MIN_GAIN)
 
 
 def prior_sigmas() -> Array:

@@ -74,13 +74,17 @@ def asked(
     poses : V estimated corrections; the partners' are built in
     options : RunOptions
     """
+    # Where less differs than a correction must win, nothing can be asked for.
+    open_ = [
+        (k, own) for k, own in enumerate(poses)
+        if own.partner != k and own.before > options.quality.asked_least
+    ]  # fmt: skip
+    if not open_:
+        return ()
     masses, pose = profiled(views, options)
     out = []
-    for k, own in enumerate(poses):
+    for k, own in open_:
         fixed, moving = masses[own.partner], masses[k]
-        # Where less differs than a correction must win, nothing can be asked for.
-        if own.partner == k or own.before <= options.quality.asked_least:
-            continue
         if fixed is None or moving is None:
             continue
         placed = dataclasses.replace(fixed, carm=poses[own.partner].applied(fixed.carm))

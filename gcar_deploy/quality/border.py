@@ -30,13 +30,13 @@ def check_border(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
     views : the pictures that it was made from
     """
     grey = [view for view in views if not view.calibrated and view.kind != "mask"]
-    meeting = tree.degrees
+    free = tree.degrees == 1
+    cut = [free & (_distance_mm(view, tree.nodes_mm) < BORDER_MM) for view in grey]
     for number, branch in enumerate(tree.branches, start=1):
-        ends = [n for n in (branch.start, branch.end) if meeting[n] == 1]
-        if branch.length_mm < LEAST_MM or not ends:
+        if branch.length_mm < LEAST_MM:
             continue
-        for view in grey:
-            if _distance_mm(view, tree.nodes_mm[ends]).min() < BORDER_MM:
+        for view, nodes in zip(grey, cut, strict=True):
+            if nodes[[branch.start, branch.end]].any():
                 return [
                     f"branch {number} runs out of view {view.view_id}: a catheter or lead, or a "
                     "vessel that is cut there?"

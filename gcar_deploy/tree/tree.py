@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from gcar_deploy.geometry.covariance import worst_sigma
 from gcar_deploy.types import Array, Points, Scalars
 
 
@@ -52,8 +53,7 @@ class Branch:
         """(m, 2) sigma in the worst direction of what the fit leaves open, and of the geometry."""
         if self.covariance_mm2 is None:
             return np.full((len(self), 2), np.nan)
-        largest: Array = np.linalg.eigvalsh(self.covariance_mm2)[..., -1]
-        return np.sqrt(np.maximum(largest, 0.0))
+        return worst_sigma(self.covariance_mm2)
 
     @property
     def tangents(self) -> Points:
