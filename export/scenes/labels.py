@@ -251,11 +251,15 @@ def _read_any(path: Path, name: str) -> tuple[Array, Array]:
 
 
 def _read_npz(path: Path, case: str) -> LabelVolume:
-    """ASOCA Normal_1 as released with 3DGR-CAR: axes are x, y, z in LPS, 180 mm cube."""
+    """ASOCA Normal_1 as released with 3DGR-CAR: axes run right, to the front, down; 180 mm cube.
+
+    The file does not say so. The other way round the ostia lie below their trees, and the left
+    tree lies as a right one does (``quality.anatomy``).
+    """
     with np.load(path, allow_pickle=False) as archive:
         if "occupancy" not in archive:
             raise UsageError(f"{path}: has no array named 'occupancy'")
-        array = archive["occupancy"]
+        array = archive["occupancy"][::-1, ::-1, ::-1]
     if array.ndim != 3:
         raise UsageError(f"{path}: 'occupancy' must have 3 axes, has {array.ndim}")
     scale = 255.0 if array.dtype == np.uint8 else 1.0

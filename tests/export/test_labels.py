@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.grid import Grid
@@ -192,3 +193,12 @@ def test_asoca_case():
     # The left tree lies to the left of, behind and above the right one.
     centre = [np.mean(t.box_mm(), axis=0) for t in (left, right)]
     assert (centre[0] > centre[1]).all()
+    # Both begin above their middle, the left one to the right of and behind its own. The other
+    # way round, the places of the trees would be these as well, and their beginnings not.
+    begins = []
+    for tree in (left, right):
+        thick = ndimage.distance_transform_edt(tree.occupancy >= 0.5)
+        index = np.argwhere(thick >= np.quantile(thick[thick > 0], 0.98)).astype(float)
+        middle = np.argwhere(tree.occupancy >= 0.5).astype(float)
+        begins.append(tree.grid.index2world(index).mean(0) - tree.grid.index2world(middle).mean(0))
+    assert begins[0][0] < 0 < begins[0][1] and begins[0][2] > 0 and begins[1][2] > 0
