@@ -70,14 +70,20 @@ def cost_curves() -> None:
 @click.option("--pictures", default="clean,degraded,mask,raw", show_default=True)
 @click.option("--predictors", default="multi,none", show_default=True)
 @click.option("--parts", is_flag=True, help="Also what sigma is worth without some of its parts.")
+@click.option("--data", type=click.Path(exists=True, file_okay=False, path_type=Path),
+              help="Folder with label volumes: take their trees instead.")  # fmt: skip
 def sigma_table(
-    seed: int, trees: int, protocols: str, pictures: str, predictors: str, parts: bool
-) -> None:
+    seed: int, trees: int, protocols: str, pictures: str, predictors: str, parts: bool,
+    data: Path | None,
+) -> None:  # fmt: skip
     """Compare the stated sigma with true errors on generated trees.
 
     Example: gcar-export sigma-table --seed 2 --trees 20
     """
+    from gcar_export.evaluate.evaluate import find_labels
     from gcar_export.studies import sigma_table as sigma
+
+    files = find_labels(data) if data else []
 
     cells = [
         (protocol, condition, predictor)
@@ -86,10 +92,11 @@ def sigma_table(
         for predictor in words(predictors)
     ]
     rows = []
-    with click.progressbar(length=len(cells) * trees, label="trees", file=sys.stderr) as bar:
+    length = len(cells) * (len(files) or trees)
+    with click.progressbar(length=length, label="trees", file=sys.stderr) as bar:
         for cell in cells:
             made = sigma.calibrate_parts(
-                *cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1)
+                *cell, seed=seed, trees=trees, on_tree=lambda: bar.update(1), files=files
             )
             rows += made if parts else made[-1:]
     click.echo(sigma.table(rows))

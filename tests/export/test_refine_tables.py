@@ -1,6 +1,7 @@
 """Tables of the refinement: modes, calibration of sigma, cost curves."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.targets import make_targets
-from gcar_export.scenes.trees import SyntheticTree, Vessel
 from gcar_export.studies import refine_table as refining
 from gcar_export.studies import sigma_table as sigma
 from gcar_export.studies.cost_curves import Curve
@@ -61,7 +61,7 @@ def test_true_points_give_the_tree_back_and_noise_costs(tmp_path, monkeypatch):
 def test_errors_are_judged_by_the_ellipse_across_the_vessel():
     """A tree moved by (0.3, 0.4): by its covariance in depth alone, or in both axes."""
     line = np.stack([np.zeros(41), np.zeros(41), np.linspace(-20, 20, 41)], axis=1)
-    truth = SyntheticTree((Vessel("v", "left", line, np.ones(41)),), "right")
+    truth = sigma.Patient(seen=lambda _: None, line_mm=line)
     parts = np.stack([np.diag([0.09, 0.04, 0.0]), np.diag([0.0, 0.12, 0.0])])
     moved = branch(line + np.array([0.3, 0.4, 0.0]), 1.0)
     moved = dataclasses.replace(moved, covariance_mm2=np.tile(parts, (41, 1, 1, 1)))
@@ -71,6 +71,21 @@ def test_errors_are_judged_by_the_ellipse_across_the_vessel():
     np.testing.assert_allclose(z2[0], 0.5 * (0.3**2 / 0.09 + 0.4**2 / 0.04))
     np.testing.assert_allclose(z2[1], 0.5 * (0.3**2 / 0.09 + 0.4**2 / 0.16))
     np.testing.assert_allclose(said, [[0.3] * 41, [0.4] * 41])
+    rough = dataclasses.replace(truth, line_sd_mm=0.4)  # of a label volume
+    np.testing.assert_allclose(
+        sigma.judged_points(made, rough)[1][0], 0.5 * (0.3**2 / 0.25 + 0.4**2 / 0.2)
+    )
+
+
+def test_what_is_relied_on_is_ok_and_no_called_ghost():
+    def told(status, probability):
+        points = np.zeros((len(probability), 3))
+        ghosts = SimpleNamespace(points=(np.array(probability),))
+        quality = SimpleNamespace(status=status, ghosts=ghosts)
+        return SimpleNamespace(quality=quality, tree=SimpleNamespace(points=lambda: points))
+
+    assert sigma.relied_on(told("ok", [0.1, 0.6, 0.49])).tolist() == [True, False, True]
+    assert not sigma.relied_on(told("degraded", [0.1, 0.2])).any()
 
 
 @pytest.mark.slow
