@@ -1,9 +1,15 @@
-"""Closed lumen surface of a tree: the zero level of the signed distance to its tubes' union."""
+"""Closed lumen surface of a tree: the zero level of the signed distance to its tubes' union.
+
+Only blocks of the lattice that the tubes touch are ever filled: a tree is less than a hundredth of
+the box round it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import struct
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -21,6 +27,10 @@ MAX_POINTS = 40_000_000
 COARSEST_MM = 0.8
 #: capsules handled at once.
 CHUNK = 64
+#: lattice points along the edge of a block
+BLOCK = 24
+#: distances are exact to so far outside, lattice edges
+FAR = 2.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,14 +59,68 @@ def lumen_surface(tree: Tree, edge_mm: float | None = None) -> Surface:
     from skimage.measure import marching_cubes
 
     lattice = lumen_lattice(tree, edge_mm)
+    vertices, faces, total = [], [], 0
+    for origin, distance in _blocks(tree, lattice):
+        own, triangles, _, _ = marching_cubes(
+            distance, level=0.0, gradient_direction="descent", allow_degenerate=False
+        )
+        vertices.append(own + origin)
+        faces.append(triangles + np.int64(total))
+        total += len(own)
+    if not vertices:
+        return Surface(vertices_mm=np.zeros((0, 3)), faces=np.zeros((0, 3), np.int64))
+    index, of = _merged(np.concatenate(vertices), lattice.shape)
+    return Surface(vertices_mm=lattice.index2world(index), faces=of[np.concatenate(faces)])
+
+
+def _blocks(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
+    """Yield first lattice index (3,) and distance (BLOCK + 1,) * 3 of what the surface crosses.
+
+    Blocks share the points of their common planes.
+    """
+    number = np.full(-(-np.array(lattice.shape) // BLOCK) + 1, -1)
+    near = [
+        (np.stack(np.unravel_index(cell, lattice.shape)), d) for cell, d in _near(tree, lattice)
+    ]
+    for at, _ in near:
+        number[tuple(at // BLOCK)] = 0
+    occupied = np.argwhere(number == 0)
+    number[tuple(occupied.T)] = np.arange(len(occupied))
     edge = float(lattice.spacing_mm[0])
-    distance = lumen_distance(tree, lattice)
+    # One more, which number -1 finds: no vessel.
+    tiles = np.full((len(occupied) + 1, BLOCK, BLOCK, BLOCK), FAR * edge, np.float32)
+    for at, value in near:
+        np.minimum.at(tiles, (number[tuple(at // BLOCK)], *(at % BLOCK)), value)
     # A vertex exactly on a lattice point would collapse triangles; nothing may be exactly 0.
-    distance[np.abs(distance) < 1e-3 * edge] = 1e-3 * edge
-    vertices, faces, _, _ = marching_cubes(
-        distance, level=0.0, gradient_direction="descent", allow_degenerate=False
-    )
-    return Surface(vertices_mm=lattice.index2world(vertices), faces=faces.astype(np.int64))
+    tiles[np.abs(tiles) < 1e-3 * edge] = 1e-3 * edge
+    for block in occupied:
+        distance = np.empty((BLOCK + 1,) * 3, np.float32)
+        for beyond in itertools.product((0, 1), repeat=3):
+            to = tuple(slice(BLOCK, None) if d else slice(BLOCK) for d in beyond)
+            of = tuple(slice(1) if d else slice(None) for d in beyond)
+            distance[to] = tiles[number[tuple(block + beyond)]][of]
+        if distance.min() < 0 < distance.max():
+            yield BLOCK * block, distance
+
+
+def _merged(vertices: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
+    """Make one of vertices that several blocks share; they are equal to the last bit.
+
+    Returns
+    -------
+    (m, 3) vertices, and (v,) which of them each of the given is
+    """
+    low = np.floor(vertices).astype(np.int64)
+    between = vertices > low
+    # Off the shared planes, and within a cell, a vertex is alone.
+    shared = ((low % BLOCK == 0) & ~between).any(axis=1)
+    edge = np.ravel_multi_index(tuple(low[shared].T), shape) * 3 + between[shared].argmax(axis=1)
+    _, first, inverse = np.unique(edge, return_index=True, return_inverse=True)
+    own = np.flatnonzero(~shared)
+    of = np.empty(len(vertices), np.int64)
+    of[own] = np.arange(len(own))
+    of[shared] = len(own) + inverse
+    return vertices[np.concatenate([own, np.flatnonzero(shared)[first]])], of
 
 
 def stl_bytes(surface: Surface, title: str = "lumen, mm, LPS") -> bytes:
@@ -93,13 +157,20 @@ def lumen_lattice(tree: Tree, edge_mm: float | None) -> Grid:
 
 def lumen_distance(tree: Tree, lattice: Grid) -> Array:
     """(nx, ny, nz) float32 signed distance near the surface, mm; a constant further outside."""
+    out = np.full(int(np.prod(lattice.shape)), FAR * float(lattice.spacing_mm[0]), np.float32)
+    for cell, value in _near(tree, lattice):
+        np.minimum.at(out, cell, value)
+    return out.reshape(lattice.shape)
+
+
+def _near(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
+    """Yield flat lattice indices near some capsules and the distance from one of these, mm."""
     capsules = tree.segments()
-    far = 2.0 * float(lattice.spacing_mm[0])
-    out = np.full(int(np.prod(lattice.shape)), far, np.float32)
+    far = FAR * float(lattice.spacing_mm[0])
     for start in range(0, len(capsules[0]), CHUNK):
         part = tuple(x[start : start + CHUNK] for x in capsules)
         cell, capsule = near_pairs((part[0], part[1], part[2], part[3]), lattice, far)
         center = lattice.index2world(np.stack(np.unravel_index(cell, lattice.shape), axis=1))
         value = capsule_distance(center, (part[0], part[1], part[2], part[3]), capsule)
-        np.minimum.at(out, cell, value.astype(np.float32))
-    return out.reshape(lattice.shape)
+        within = value < far
+        yield cell[within], value[within].astype(np.float32)

@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
 
-from gcar_deploy.tree.surface import lumen_surface, stl_bytes
+from gcar_deploy.tree.surface import (
+    BLOCK,
+    lumen_distance,
+    lumen_lattice,
+    lumen_surface,
+    stl_bytes,
+)
 from gcar_deploy.tree.tree import empty_tree
 from tests.tree.shapes import enclosed_mm3, fork, tube
 
@@ -46,3 +54,18 @@ def test_stl_is_read_by_vtk(tmp_path):
 
 def test_no_tree_no_triangle():
     assert len(lumen_surface(empty_tree()).faces) == 0
+
+
+@pytest.mark.parametrize("edge_mm", [0.3, 0.5])
+def test_blocks_give_the_surface_of_the_whole_lattice(edge_mm):
+    tree = fork()
+    lattice = lumen_lattice(tree, edge_mm)
+    assert max(lattice.shape) > 2 * BLOCK
+    distance = lumen_distance(tree, lattice)
+    distance[np.abs(distance) < 1e-3 * edge_mm] = 1e-3 * edge_mm
+    index, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
+    surface = lumen_surface(tree, edge_mm)
+    assert (len(surface.vertices_mm), len(surface.faces)) == (len(index), len(faces))
+    off, _ = cKDTree(lattice.index2world(index)).query(surface.vertices_mm)
+    assert off.max() < 1e-4
+    assert (edge_counts(surface.faces) == 2).all()
