@@ -91,6 +91,7 @@ def models() -> list[dict[str, Any]]:
 def _model(kind: Kind) -> dict[str, Any]:
     from gcar_deploy.errors import ModelError
     from gcar_deploy.imaging.net import open_segmenter
+    from gcar_deploy.models import check_graph
     from gcar_deploy.predict import PREDICTORS, open_predictor, read_predictor
 
     out = {"name": kind.shipped, "sha256": None, "sound": False, "golden": None}
@@ -101,6 +102,7 @@ def _model(kind: Kind) -> dict[str, Any]:
             session = open_predictor(read_predictor(kind.path), threads=1).session
         else:
             session = open_segmenter(kind.path, threads=1).session
+        check_graph(kind.path.name, session.model.data)
         worst = session.check_golden()
     except ModelError as error:
         return {**out, "sentence": str(error)}

@@ -2,7 +2,7 @@
 
 from gcar_deploy.models.golden import Golden, check_golden, golden_path, read_golden
 from gcar_deploy.models.session import Session
-from gcar_deploy.models.spec import Kind, ModelFile, read_model, shipped_model_path
+from gcar_deploy.models.spec import Kind, ModelFile, check_graph, read_model, shipped_model_path
 
 __all__ = [
     "Golden",
@@ -10,6 +10,7 @@ __all__ = [
     "ModelFile",
     "Session",
     "check_golden",
+    "check_graph",
     "golden_path",
     "read_golden",
     "read_model",

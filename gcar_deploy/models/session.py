@@ -24,7 +24,8 @@ class Session:
 
     Parameters
     ----------
-    model : ModelFile, as ``read_model`` returns it; its golden case, if any, is run at once
+    model : ModelFile, as ``read_model`` returns it; its golden case, if any, is run at once,
+        unless it is pinned
     inputs : names of the graph's inputs that the caller will give
     threads : int, within one inference; spinning is off, so idle threads cost nothing
     arena : bool, keep the memory of an inference for the next one: a quarter faster
@@ -52,7 +53,8 @@ class Session:
             if sorted(found) != sorted(inputs) or not runtime.get_outputs():
                 raise ModelError(f"model {model.name} has other inputs than this version gives")
         self._runtime = runtime
-        self.check_golden()
+        if not model.pinned:
+            self.check_golden()
 
     def check_golden(self) -> float | None:
         """Run the model's golden case again; return the largest difference, None without one.

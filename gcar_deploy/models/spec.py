@@ -18,7 +18,7 @@ from gcar_deploy.models.guard import check_onnx
 
 SCHEMA = "gcar-model/1"
 _MAX_SPEC_BYTES = 64 * 2**10
-_PLACE = "gcar_models"
+_PLACE, _LIST = "gcar_models", "SHA256SUMS"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +55,8 @@ class ModelFile:
     spec : dict, the content of the ``.json`` beside the ``.onnx``
     sha256 : str of the ONNX file
     data : bytes of the ONNX file
+    pinned : bool, the file comes along and has the hash that the release lists: neither walked by
+        the guard nor held to its golden case as it is opened, both of which ``gcar doctor`` does
     golden : Golden or None, a small case with its answer, where there is one beside the model
     """
 
@@ -62,6 +64,7 @@ class ModelFile:
     spec: dict[str, Any]
     sha256: str
     data: bytes = dataclasses.field(repr=False)
+    pinned: bool = False
     golden: Golden | None = dataclasses.field(default=None, repr=False)
 
     @property
@@ -89,6 +92,8 @@ def shipped_model_path(name: str) -> Path | None:
 def read_model(path: Path, kinds: Sequence[Kind], limits: ModelLimits | None = None) -> ModelFile:
     """Read and verify an ONNX file and the spec beside it; nothing of the model is run.
 
+    A shipped file with the hash that the release lists is not walked again: see ``pinned``.
+
     Parameters
     ----------
     path : of the ``.onnx``; its ``.json`` and, where there is one, its ``.golden.npz`` lie beside
@@ -112,17 +117,42 @@ def read_model(path: Path, kinds: Sequence[Kind], limits: ModelLimits | None = N
             f"its spec says {str(spec.get('sha256'))[:12]}"
         )
     _check_kind(path.name, spec, kinds)
-    try:
-        check_onnx(data, limits)
-    except ValueError as error:
-        raise ModelError(f"model file {path.name} {error}") from None
-    return ModelFile(
+    model = ModelFile(
         name=str(spec.get("name", path.stem)),
         spec=spec,
         sha256=digest,
         data=data,
+        pinned=digest == _listed(path),
         golden=read_golden(path, digest, limits),
     )
+    if not model.pinned:
+        check_graph(path.name, data, limits)
+    return model
+
+
+def check_graph(name: str, data: bytes, limits: ModelLimits | None = None) -> None:
+    """Refuse a file whose graph holds what a model of this project does not need; see ``guard``.
+
+    Raises
+    ------
+    ModelError
+    """
+    try:
+        check_onnx(data, limits or ModelLimits())
+    except ValueError as error:
+        raise ModelError(f"model file {name} {error}") from None
+
+
+def _listed(path: Path) -> str | None:
+    """SHA-256 that the release lists for the file at ``path``; None for a file of others."""
+    place = Path(str(resources.files(_PLACE)))
+    try:
+        if not path.parent.samefile(place):
+            return None
+        lines = (place / _LIST).read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return next((line[:64] for line in lines if line[64:].strip() == path.name), None)
 
 
 def _check_kind(name: str, spec: dict[str, Any], kinds: Sequence[Kind]) -> None:

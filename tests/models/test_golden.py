@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 import json
@@ -17,6 +18,7 @@ from gcar_deploy.config import ModelLimits
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.models.golden import check_golden, golden_path, read_golden
+from gcar_deploy.models.session import Session
 from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor
 from gcar_deploy.predict.kinds import MULTI, PREDICTORS, read_predictor
@@ -54,6 +56,28 @@ def test_every_shipped_model_has_one_and_keeps_it():
         assert found.golden is not None, f"{model.name}: gcar-export golden {model.name}"
         session = ort.InferenceSession(found.data, providers=["CPUExecutionProvider"])
         assert check_golden(found.name, found.golden, session.run) < 1e-4
+
+
+def test_a_shipped_model_is_checked_by_its_hash_alone(tmp_path):
+    """Neither the guard nor the golden case sees it; a copy elsewhere is a stranger's."""
+    shipped, none = SEGMENTER.path, ModelLimits(max_nodes=1)
+    assert shipped is not None
+    found = read_model(shipped, KINDS, none)
+    assert found.pinned
+    assert found.golden is not None
+    wrong = {name: array + 1 for name, array in found.golden.outputs.items()}
+    golden = dataclasses.replace(found.golden, outputs=wrong)
+    inputs = list(golden.inputs)
+    session = Session(dataclasses.replace(found, golden=golden), inputs, threads=1)
+    with pytest.raises(ModelError, match="golden case"):
+        session.check_golden()
+    with pytest.raises(ModelError, match="golden case"):
+        Session(dataclasses.replace(found, golden=golden, pinned=False), inputs, threads=1)
+    for suffix in (".onnx", ".json", ".golden.npz"):
+        shutil.copy(shipped.with_suffix(suffix), tmp_path / f"segmenter{suffix}")
+    assert not read_model(tmp_path / shipped.name, KINDS).pinned
+    with pytest.raises(ModelError, match="more than 1 nodes"):
+        read_model(tmp_path / shipped.name, KINDS, none)
 
 
 def test_shipped_files_are_those_of_the_manifest():
