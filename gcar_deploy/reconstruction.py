@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any, Self
@@ -38,7 +39,6 @@ SCHEMA = "gcar-result/1"
 RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or treatment."
 _PACKAGES = (
     "gcar", "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "onnxruntime",
-    "nibabel",
 )  # fmt: skip
 _LUMEN = (
     "/minimal_diameter_mm", "/minimal_at_mm", "/reference_diameter_mm", "/stenosis_percent",
@@ -343,9 +343,12 @@ def versions() -> dict[str, str | None]:
     found: dict[str, str | None] = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            about = metadata.distribution(name).read_text("METADATA") or ""
         except metadata.PackageNotFoundError:
-            found[name] = None
+            about = ""
+        # ``metadata.version`` parses pages of licences for this one line.
+        line = re.search(r"^Version: *(\S+)", about, re.MULTILINE)
+        found[name] = line and line[1]
     return found
 
 

@@ -49,7 +49,7 @@ HEAVY = ("numpy", "scipy", "cv2", "skimage", "onnxruntime", "nibabel", "torch", 
 WALLED = {
     "torch": {"gaussians/torch_project.py"},
     "onnxruntime": {"models/session.py"},
-    "nibabel": {"output/volume.py"},
+    "nibabel": set(),
     "pydicom": {
         "dicom/header.py",
         "dicom/frames.py",
@@ -218,6 +218,22 @@ def test_help_loads_nothing_heavy():
         "    gcar.main(['--help'], standalone_mode=False)"
     )
     assert not loaded_by(code) & set(HEAVY)
+
+
+@pytest.mark.req("REQ-37")
+def test_a_run_of_pictures_loads_only_what_it_uses(tmp_path):
+    """No DICOM, no library that reads other people's files, nothing for three views."""
+    code = (
+        "from gcar_deploy.data.demo_case import demo_case\n"
+        "from gcar_deploy.engine import Engine\n"
+        "case = demo_case()\n"
+        "result = Engine(threads=1).reconstruct(case.pictures, case.geometry)\n"
+        f"result.save({str(tmp_path / 'out')!r})"
+    )
+    loaded = loaded_by(code)
+    spared = ("nibabel", "pydicom", "gdcm", "matplotlib", "scipy.interpolate", "scipy.stats",
+              "scipy.signal", "skimage.morphology", "flask", "onnx", "torch")  # fmt: skip
+    assert not loaded & set(spared)
 
 
 @pytest.mark.req("REQ-37")

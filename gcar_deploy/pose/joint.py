@@ -13,8 +13,6 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.optimize import minimize
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
@@ -161,6 +159,10 @@ class _Problem:
         So each pair is asked once for its misfit at every such shift, and the offsets are sought
         on those curves, from many starts: profiles that are far off have many local minima.
         """
+        # Of three and more views alone, and 0.1 s to import.
+        from scipy.interpolate import CubicSpline
+        from scipy.optimize import minimize
+
         steps = np.arange(-2 * SEARCH_MM, 2 * SEARCH_MM + 1e-9, STEP_MM)
         zero, curves = np.zeros_like(first), []
         for i, j in self.pairs:

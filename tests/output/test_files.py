@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import hashlib
 import io
 import json
@@ -11,6 +12,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.measured import measured
 from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.tables import centerline_vtp, gaussians_ply
@@ -97,6 +99,18 @@ def test_volume_by_nibabel(result, folder):
     ras = nibabel.affines.apply_affine(image.affine, index)
     gap = np.linalg.norm(ras[:, None] * (-1, -1, 1) - result.tree.points()[None], axis=2)
     assert gap.min(axis=1).max() < 3.0
+
+
+def test_volume_is_what_nibabel_writes():
+    nibabel = pytest.importorskip("nibabel")
+    grid = Grid(center_mm=(1.5, -2, 3), size_mm=(18, 20, 22), shape=(9, 11, 13))
+    volume = np.random.default_rng(0).random(grid.shape, np.float32)
+    image = nibabel.Nifti1Image(volume, grid.affine_ras())
+    image.header.set_xyzt_units("mm")
+    image.header["descrip"], image.header["cal_max"] = b"gcar vessel occupancy 0..1", 1.0
+    image.set_sform(grid.affine_ras(), code=1)
+    image.set_qform(grid.affine_ras(), code=1)
+    assert gzip.decompress(nifti_bytes(volume, grid)) == image.to_bytes()
 
 
 def test_volume_bytes_hold_no_clock(result):
