@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -117,20 +118,37 @@ def plane_slices(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> tuple
         Both sources coincide, or the isocentre lies between them on one line: no plane is
         defined.
     """
-    base = second.source_mm - first.source_mm
-    length = float(np.linalg.norm(base))
+    return slices_along(plane_axes(first, second), carm, pixels)
+
+
+def plane_axes(first: CArm, second: CArm) -> Array:
+    """(3, 3) columns: across and within the plane of the isocentre, and along both sources.
+
+    Raises
+    ------
+    GeometryError
+        As ``plane_slices``.
+    """
+    source = first.source_mm
+    base = second.source_mm - source
+    length = _length(base)
     if length < 1e-6:
         raise GeometryError("both views have the same source: they have no epipolar planes")
     base = base / length
-    towards = -first.source_mm - (-first.source_mm @ base) * base
-    distance = float(np.linalg.norm(towards))
+    towards = -source - (-source @ base) * base
+    distance = _length(towards)
     if distance < 1e-6:
         raise GeometryError("the views face each other exactly: no plane through the isocentre")
-    e1 = towards / distance
-    e2 = np.cross(base, e1)
+    (x, y, z), (a, b, c) = base.tolist(), (towards / distance).tolist()
+    # Plain numbers: for three of them np.cross takes ten times as long.
+    return np.array([[y * c - z * b, a, x], [z * a - x * c, b, y], [x * b - y * a, c, z]])
+
+
+def slices_along(plane_axes: Array, carm: CArm, pixels: Pixels) -> tuple[Scalars, Scalars]:
+    """``plane_slices`` about the (3, 3) axes of ``plane_axes``."""
     # A pixel's ray is M^-1 (col, row, 1), of unit depth; its share along three axes.
     M = carm.world2pixel[:, :3]
-    axes = np.linalg.solve(M.T, np.stack([e2, e1, base], axis=1))
+    axes = np.linalg.solve(M.T, plane_axes)
     rays = np.asarray(pixels, dtype=np.float64) @ axes[:2] + axes[2]
     across, ahead, along = rays.T
     from_base = across * across + ahead * ahead
@@ -140,11 +158,16 @@ def plane_slices(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> tuple
     return np.arctan2(across, ahead), weight
 
 
+def _length(vector: Array) -> float:
+    return math.sqrt(vector @ vector)
+
+
 def plane_normal(first: CArm, second: CArm) -> Array:
     """(3,) unit normal of the epipolar plane through the isocentre: the visible direction.
 
     Motion along it shows in the pictures; motion within the plane does not.
     """
-    normal = np.cross(first.axes[2], second.axes[2])
-    length = float(np.linalg.norm(normal))
+    (x, y, z), (a, b, c) = first.axes[2].tolist(), second.axes[2].tolist()
+    normal = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
+    length = _length(normal)
     return normal / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])

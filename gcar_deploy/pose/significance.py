@@ -9,6 +9,7 @@ mass profiles is compared with what the shift alone leaves: that is the noise of
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -112,6 +113,24 @@ class _Pair:
             carm = carm.turned(float(x[1]), float(x[2]))
         return dataclasses.replace(self.moving, pixels=pixels), carm.moved(x[0] * normal)
 
+    @functools.cached_property
+    def start(self) -> float:
+        """Shift in mm alone that makes the coarse profiles agree best."""
+
+        def apart(shift: float) -> float:
+            x = np.array([shift, 0.0, 0.0, 0.0])
+            rest = self.residuals(x, self.coarse_mm)
+            return float(np.sum(np.append(rest, shift / _REACH[0]) ** 2))
+
+        shifts = np.linspace(-SEARCH_MM, SEARCH_MM, round(2 * SEARCH_MM / STEP_MM) + 1)
+        return float(min(shifts, key=apart))
+
+    def residuals(self, x: Array, sigma_mm: float) -> Scalars:
+        """(bins,) difference of the profiles, in units of its error."""
+        a, b = mass_profiles(self.fixed, *self.changed(x), sigma_mm)
+        out: Scalars = (a - b) / (_NOISE * np.sqrt(float(a @ a)))
+        return out
+
     def fitted(self, free: list[int]) -> Array:
         """(4,) what makes the profiles agree best where only ``free`` may change."""
 
@@ -122,14 +141,11 @@ class _Pair:
 
         def residuals(y: Scalars, sigma_mm: float) -> Scalars:
             x = whole(y)
-            a, b = mass_profiles(self.fixed, *self.changed(x), sigma_mm)
-            apart = (a - b) / (_NOISE * np.sqrt(float(a @ a)))
-            out: Scalars = np.concatenate([apart, x[free] / _REACH[free]])
+            out: Scalars = np.concatenate([self.residuals(x, sigma_mm), x[free] / _REACH[free]])
             return out
 
-        starts = np.zeros((round(2 * SEARCH_MM / STEP_MM) + 1, len(free)))
-        starts[:, 0] = np.linspace(-SEARCH_MM, SEARCH_MM, len(starts))
-        y = min(starts, key=lambda s: float(np.sum(residuals(s, self.coarse_mm) ** 2)))
+        y = np.zeros(len(free))
+        y[0] = self.start
         for sigma_mm in (2 * self.coarse_mm, self.coarse_mm, self.fine_mm):
             y = least_squares(
                 residuals, y, args=(sigma_mm,), diff_step=1e-2, max_nfev=_MOST_STEPS
