@@ -170,6 +170,24 @@ def gathered(
 
 
 @contextlib.contextmanager
+def until_stopped() -> Iterator[None]:
+    """Take Ctrl-C for the end of a service, not for an error."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        click.echo("gcar: stopping", err=True)
+
+
+def serve_until_stopped(server: Any) -> None:
+    """Run a server of ``worker.loopback`` until Ctrl-C; its port is free afterwards."""
+    try:
+        with until_stopped():
+            server.run()
+    finally:
+        server.close()
+
+
+@contextlib.contextmanager
 def needs_extra(extra: str, *packages: str) -> Iterator[None]:
     """Turn a missing library of an extra into one line that says what to install.
 

@@ -17,6 +17,7 @@ from gcar_deploy.cli.common import (
     gathered,
     needs_extra,
     talk_options,
+    until_stopped,
 )
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.inputs.order import Order
@@ -122,11 +123,10 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
     queue = JobQueue(work, on_change=on_change)
     listener = Listener(queue, out_dir, title=title, runs=service.runs)
     try:
-        found = listener.start(service.port)
-        click.echo(f"gcar: {title} on {LOOPBACK}:{found}", err=True)
-        over.wait()
-    except KeyboardInterrupt:
-        click.echo("gcar: stopping", err=True)
+        with until_stopped():
+            found = listener.start(service.port)
+            click.echo(f"gcar: {title} on {LOOPBACK}:{found}", err=True)
+            over.wait()
     finally:
         listener.stop()
         queue.close()

@@ -11,7 +11,14 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, needs_extra, talk_options
+from gcar_deploy.cli.common import (
+    EngineChoice,
+    Talk,
+    engine_options,
+    needs_extra,
+    serve_until_stopped,
+    talk_options,
+)
 from gcar_deploy.cli.request import METHOD, READING, order_options
 from gcar_deploy.inputs.order import Order, check_views
 
@@ -67,12 +74,7 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
         click.echo(address)
         if not no_browser:
             webbrowser.open(address)
-        try:
-            server.run()
-        except KeyboardInterrupt:
-            click.echo("gcar: stopping", err=True)
-        finally:
-            server.close()
+        serve_until_stopped(server)
     finally:
         queue.close()
 

@@ -19,6 +19,7 @@ from gcar_deploy.cli.common import (
     engine_options,
     gathered,
     needs_extra,
+    serve_until_stopped,
     talk_options,
 )
 from gcar_deploy.cli.request import order_options
@@ -162,12 +163,7 @@ def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib
         click.echo(f"gcar: http://{LOOPBACK}:{server.effective_port}", err=True)
         if fresh:
             click.echo(f"gcar: token {token}", err=True)
-        try:
-            server.run()
-        except KeyboardInterrupt:
-            click.echo("gcar: stopping", err=True)
-        finally:
-            server.close()
+        serve_until_stopped(server)
     finally:
         queue.close()
 
