@@ -10,8 +10,9 @@ from gcar_deploy.flow import PressureDrop, VesselPressure
 from gcar_deploy.output.overlay import branch_color
 from gcar_deploy.types import Array
 
-_WIDTH, _HEIGHT = 760, 330
-_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 744, 18, 286
+_WIDTH, _HEIGHT = 760, 344
+# The axis' title stands above its highest number, clear of it.
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 744, 32, 300
 #: no more points a curve
 _POINTS = 120
 
