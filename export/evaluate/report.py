@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,11 +86,12 @@ def tree_figure(out: Path, protocol: str, case: str, views: int, methods: Sequen
             if column == 0:
                 axis.set_ylabel(SIDES[row])
         axes[0, column].set_title(title, fontsize=9)
-    fig.suptitle(
+    title = (
         f"{case}, {protocol} protocol, {views} views: white in both, red in the method's alone, "
-        "blue missed",
-        fontsize=10,
+        "blue missed"
     )
+    # A figure of one method is narrow.
+    fig.suptitle(textwrap.fill(title, int(12 * fig.get_figwidth())), fontsize=10)
     return fig
 
 
