@@ -12,7 +12,7 @@ import click
 
 from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions
 from gcar_deploy.inputs.order import MOST_VIEWS, POSES, Order, load_order
-from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_mask
+from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_lesion, parse_mask
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Option: TypeAlias = Callable[[Any], Any]
@@ -73,6 +73,10 @@ OPTIONS: Mapping[str, _Option] = {
     "masks": click.option(
         "--mask", "masks", multiple=True, metavar="N:PICTURE",
         help="Vessel mask of view N, which wins over what is found in the picture; repeatable.",
+    ),
+    "lesions": click.option(
+        "--lesion", "lesions", multiple=True, metavar="N:C1,R1:C2,R2",
+        help="Proximal and distal border of a lesion in view N; wins over those found; repeatable.",
     ),
     "strict": click.option(
         "--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6)."
@@ -146,4 +150,6 @@ def made_order(said: Mapping[str, Any]) -> Order:
         values["frames"] = parse_frames(values["frames"])
     if "landmarks" in values:
         values["landmarks"] = tuple(parse_landmark(text) for text in values["landmarks"])
+    if "lesions" in values:
+        values["lesions"] = tuple(parse_lesion(text) for text in values["lesions"])
     return dataclasses.replace(Order() if file is None else load_order(file), **values)

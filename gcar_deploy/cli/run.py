@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.argument(
     "views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 [VIEW3 ...]"
 )
-@order_options("out", *METHOD, *READING, "strict", "force", *EXTRA_FILES, "file")
+@order_options("out", *METHOD, *READING, "lesions", "strict", "force", *EXTRA_FILES, "file")
 @click.option("--print-order", is_flag=True, help="Print the order as JSON and do nothing else.")
 @click.option(
     "--keep-steps",

@@ -6,9 +6,10 @@ import math
 import re
 from pathlib import Path
 
-from gcar_deploy.config import Landmark
+from gcar_deploy.config import Landmark, LesionBorders
 from gcar_deploy.errors import UsageError
 
+_LESION = re.compile(r"([1-9]|1[0-6]):([^:]+):([^:]+)")
 _MASK = re.compile(r"([1-9]|1[0-6]):(.+)", re.DOTALL)
 
 
@@ -36,19 +37,38 @@ def parse_landmark(text: str) -> Landmark:
     """
     out: list[tuple[float, float] | None] = []
     for part in text.split(":"):
-        if part.strip() == "-":
-            out.append(None)
-            continue
-        try:
-            column, row = (float(word) for word in part.split(","))
-        except ValueError:
-            column = row = math.nan
-        if not (math.isfinite(column) and math.isfinite(row)):
+        point = None if part.strip() == "-" else _point(part)
+        if point is None and part.strip() != "-":
             raise UsageError(
                 f"landmark {text[:60]!r} must be column,row:column,row with one point per view"
             )
-        out.append((column, row))
+        out.append(point)
     return tuple(out)
+
+
+def parse_lesion(text: str) -> LesionBorders:
+    """Read ``N:C1,R1:C2,R2``: proximal and distal border of a lesion in view N.
+
+    Raises
+    ------
+    UsageError
+    """
+    found = _LESION.fullmatch(text)
+    ends = [] if found is None else [_point(found[2]), _point(found[3])]
+    if found is None or ends[0] is None or ends[1] is None:
+        raise UsageError(
+            f"lesion {text[:60]!r} must be N:column,row:column,row, N the number of the view"
+        )
+    return LesionBorders(view=int(found[1]), proximal=ends[0], distal=ends[1])
+
+
+def _point(text: str) -> tuple[float, float] | None:
+    """(column, row) of ``C,R``; None where it is none."""
+    try:
+        column, row = (float(word) for word in text.split(","))
+    except ValueError:
+        return None
+    return (column, row) if math.isfinite(column) and math.isfinite(row) else None
 
 
 def parse_mask(text: str) -> tuple[int, Path]:

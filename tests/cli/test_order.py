@@ -12,6 +12,7 @@ import pytest
 
 from gcar_deploy.batch.work import run_case
 from gcar_deploy.cli.request import made_order
+from gcar_deploy.config import LesionBorders
 from gcar_deploy.inputs.order import Order, load_order
 from tests.cli.conftest import gcar
 
@@ -69,6 +70,23 @@ def test_a_printed_order_names_its_files_from_anywhere(good_case, tmp_path, monk
     assert all(path.is_file() and path.is_absolute() for path in order.files.values())
     assert sorted(order.files) == ["geometry", "mask2", "view1", "view2"]
     assert order.frames == (7, None) and order.out is None
+
+
+def test_lesions_of_the_command_line_are_those_of_an_order(good_case, tmp_path):
+    told = ("--lesion", "1:10,20.5:30,40", "--lesion", "2:1,2:3,4")
+    (tmp_path / "o.json").write_text(
+        gcar(*arguments(good_case, tmp_path / "a", *told, "--print-order")).out
+    )
+    assert load_order(tmp_path / "o.json").lesions == (
+        LesionBorders(view=1, proximal=(10.0, 20.5), distal=(30.0, 40.0)),
+        LesionBorders(view=2, proximal=(1.0, 2.0), distal=(3.0, 4.0)),
+    )
+    for text, words in (
+        ("3:1,2:3,4", "lesions.view = 3: there are views 1 .. 2"), ("1:1,2", "'1:1,2' must be N:"),
+        ("0:1,2:3,4", "must be N:"), ("1:1,nan:3,4", "must be N:"), ("1:1,2:3,4:5,6", "must be"),
+    ):  # fmt: skip
+        done = gcar(*arguments(good_case, tmp_path / "a", "--lesion", text))
+        assert done.code == 2 and words in done.err and not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize(
