@@ -53,9 +53,11 @@ WALLED = {
     "pydicom": {
         "dicom/header.py",
         "dicom/frames.py",
+        "output/dicom_sr.py",
         "output/dicom_stl.py",
         "output/dicom_study.py",
     },
+    "highdicom": {"output/dicom_sr.py"},
     "distributed": {"batch/pools.py"},
     "pynetdicom": {"worker/listen.py", "worker/send.py"},
     "flask": {"worker/http.py", "worker/loopback.py", "workbench/http.py"},

@@ -43,7 +43,7 @@ _SERVICE = {
     "once": click.option("--once", is_flag=True, help="End after the first study."),
     "send_to": click.option(
         "--send-to", metavar="AET@HOST:PORT",
-        help="Send surface and overlays back into the study by C-STORE.",
+        help="Send surface, overlays and measurements back into the study by C-STORE.",
     ),
     "runs": click.option(
         "--runs", type=click.IntRange(2, 16), default=2, show_default=True,
@@ -71,10 +71,11 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
     """Receive angiography runs by DICOM C-STORE and reconstruct each study.
 
     Listens on 127.0.0.1 alone. When a sender lets go and a study has enough runs, its result
-    appears as OUT/STUDY_INSTANCE_UID, and one line of JSON on stdout says so. With --send-to the
-    surface (Encapsulated STL) and the overlays (Secondary Capture) also go to a storage service,
-    as new series of the same study and patient; the folder is kept whatever that service answers.
-    Ctrl-C or SIGTERM ends it.
+    appears as OUT/STUDY_INSTANCE_UID, and one line of JSON on stdout says so. What has arrived and
+    what a study waits for is said on stderr. With --send-to the surface (Encapsulated STL), the
+    overlays (Secondary Capture) and the measurements (Comprehensive 3D SR) also go to a storage
+    service, as new series of the same study and patient; the folder is kept whatever that service
+    answers. Ctrl-C or SIGTERM ends it.
 
     \b
     Example:
@@ -90,7 +91,7 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
     title = service.title
     if not (title.isascii() and title.isprintable() and 1 <= len(title.strip()) <= 16):
         raise UsageError(f"--title {title!r} must be 1 .. 16 plain characters")
-    with needs_extra("listen", "pynetdicom", "pydicom"):
+    with needs_extra("listen", "pynetdicom", "pydicom", "highdicom"):
         from gcar_deploy.worker.listen import LOOPBACK, Listener, tell
         from gcar_deploy.worker.send import parse_peer, sent_back
     from gcar_deploy.worker.jobs import Job, JobQueue
@@ -114,14 +115,17 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
     def work(order: Any, on_progress: Any, cancel: Any) -> Any:
         summary, folder = do_order(warm, order, on_progress, cancel, limit_s=service.limit)
         if peer is not None:
-            summary |= sent_back(folder, order.views[0], peer, title)
+            summary |= sent_back(folder, order.views, peer, title)
             if summary["send_error"]:
                 click.echo(f"gcar: not sent: {summary['send_error']}", err=True)
         return summary, folder
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     queue = JobQueue(work, on_change=on_change)
-    listener = Listener(queue, out_dir, title=title, runs=service.runs)
+    listener = Listener(
+        queue, out_dir, title=title, runs=service.runs,
+        say=lambda line: click.echo(f"gcar: {line}", err=True),
+    )  # fmt: skip
     try:
         with until_stopped():
             found = listener.start(service.port)

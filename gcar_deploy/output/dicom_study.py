@@ -1,71 +1,137 @@
 """A result as DICOM objects of the study that its pictures came from, by pydicom.
 
-The surface becomes an Encapsulated STL (PS3.3 A.85), each overlay a Secondary Capture (A.8). Who
-the patient is and which study it was are copied from the first run; nothing else is.
+The surface becomes an Encapsulated STL (PS3.3 A.85), each overlay a Secondary Capture (A.8), the
+measurements a structured report (``dicom_sr``), a printed page an Encapsulated PDF (A.45). Who the
+patient is and which study it was are copied from the first run; nothing else is.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import pydicom
 from pydicom.dataset import FileDataset, FileMetaDataset
-from pydicom.uid import ExplicitVRLittleEndian, SecondaryCaptureImageStorage, generate_uid
+from pydicom.uid import (
+    EncapsulatedPDFStorage,
+    ExplicitVRLittleEndian,
+    SecondaryCaptureImageStorage,
+    generate_uid,
+)
 
-from gcar_deploy.errors import GcarError
+from gcar_deploy.errors import GcarError, ImageError, UsageError
+from gcar_deploy.output.dicom_sr import measurement_report
 from gcar_deploy.output.dicom_stl import dicom_stl, equipment
+from gcar_deploy.output.stored import read_folder
 
 #: Patient and General Study modules (PS3.3 C.7.1.1, C.7.2.1), as far as they are told
-_COPIED = (
-    "SpecificCharacterSet", "PatientName", "PatientID", "PatientBirthDate", "PatientSex",
-    "StudyInstanceUID", "StudyDate", "StudyTime", "ReferringPhysicianName", "StudyID",
-    "AccessionNumber", "StudyDescription",
+_COPIED = ("SpecificCharacterSet", "StudyInstanceUID", "StudyDescription")
+#: those of them that must stand in every object, empty where nobody knows (type 2)
+_EMPTY = (
+    "PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime",
+    "ReferringPhysicianName", "StudyID", "AccessionNumber",
 )  # fmt: skip
 _OVERLAYS = "Coronary tree over the X-ray pictures, research use only"
+_PAGE = "Coronary report, research use only"
 
 
-def study_objects(folder: Path, run: Path) -> list[Any]:
+def study_objects(folder: Path, runs: Sequence[Path], pdf: Path | None = None) -> dict[str, Any]:
     """Make the objects of a result folder.
 
     Parameters
     ----------
-    folder : with ``surface.stl`` and ``overlay_view1.png`` ...
-    run : DICOM file of one of the pictures
+    folder : result folder
+    runs : DICOM files of its pictures
+    pdf : a page printed from the report, or None
 
     Returns
     -------
-    data sets with file meta information: the surface, then the overlays as one series
+    name of a file -> data set with file meta information: the surface, the overlays as one series,
+    the measurements, the page
 
     Raises
     ------
     GcarError
-        A file of the folder cannot be read.
+        A file cannot be read, the result was not made from these runs, they are of several
+        studies, or highdicom is missing.
     """
-    study = pydicom.dcmread(run, stop_before_pixels=True)
+    stored = read_folder(folder)
+    headers = [_header(run, stored.summary) for run in runs]
+    if len(headers) != len(stored.summary["views"]):
+        raise UsageError(f"{len(headers)} runs: the result has {len(stored.summary['views'])}")
+    study = headers[0]
     try:
         surface = dicom_stl((folder / "surface.stl").read_bytes(), [str(study.StudyInstanceUID)])
         overlays = sorted(folder.glob("overlay_view*.png"))
         series = generate_uid()
-        made = [surface]
-        made += [_capture(path, k, series) for k, path in enumerate(overlays, start=1)]
+        made = {"surface.dcm": surface}
+        for k, path in enumerate(overlays, start=1):
+            made[f"{path.stem}.dcm"] = _capture(path, k, series)
+        if pdf is not None:
+            made["page.dcm"] = _page(pdf)
     except OSError as error:
-        raise GcarError(f"{folder} cannot be read back ({error.strerror})") from None
-    for data in made:
-        for keyword in _COPIED:
+        raise GcarError(f"{error.filename} cannot be read ({error.strerror})") from None
+    for data in made.values():
+        for keyword in (*_COPIED, *_EMPTY):
             if keyword in study:
                 setattr(data, keyword, study[keyword].value)
-    return [_as_stored(data) for data in made]
+    made["measurements.dcm"] = measurement_report(
+        stored, headers, str(surface.FrameOfReferenceUID), (generate_uid(), 3)
+    )
+    return {name: _as_stored(data) for name, data in made.items()}
+
+
+def _header(run: Path, told: Mapping[str, Any]) -> Any:
+    """Header of a run that the result was made from: nobody else's study gets it."""
+    try:
+        data = run.read_bytes()
+        found = pydicom.dcmread(io.BytesIO(data), stop_before_pixels=True)
+    except (OSError, pydicom.errors.InvalidDicomError):
+        raise ImageError(f"{run} cannot be read as DICOM") from None
+    own = hashlib.sha256(data).hexdigest()
+    if own not in {view["picture"]["sha256"] for view in told["views"]}:
+        raise UsageError(f"{run} is none of the files that the result was made from")
+    missing = [k for k in ("StudyInstanceUID", "SOPClassUID", "SOPInstanceUID") if k not in found]
+    if missing:
+        raise ImageError(f"{run} has no {missing[0]}: no object can be filed beside it")
+    for keyword in _EMPTY:
+        if keyword not in found:
+            setattr(found, keyword, "")
+    return found
+
+
+def file_bytes(data: Any) -> bytes:
+    """Return a data set as the content of a DICOM file."""
+    stream = io.BytesIO()
+    data.save_as(stream, enforce_file_format=True)
+    return stream.getvalue()
 
 
 def _as_stored(data: Any) -> Any:
     """Write and read once, so that every element has the encoding the meta information tells."""
-    stream = io.BytesIO()
-    data.save_as(stream, enforce_file_format=True)
-    stream.seek(0)
-    return pydicom.dcmread(stream)
+    return pydicom.dcmread(io.BytesIO(file_bytes(data)))
+
+
+def _new(kind: str, modality: str, series: str, number: int) -> Any:
+    """Return a data set with the modules that all share, empty where the run fills them in."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = kind
+    meta.MediaStorageSOPInstanceUID = generate_uid()
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
+    data.SOPClassUID, data.SOPInstanceUID = kind, meta.MediaStorageSOPInstanceUID
+    data.StudyInstanceUID, data.SeriesInstanceUID = generate_uid(), series
+    for keyword in _EMPTY:
+        setattr(data, keyword, "")
+    data.Modality, data.ConversionType = modality, "WSD"
+    data.SeriesNumber, data.InstanceNumber = number, 1
+    data.BurnedInAnnotation = "NO"
+    equipment(data)
+    return data
 
 
 def _capture(path: Path, number: int, series: str) -> Any:
@@ -73,26 +139,30 @@ def _capture(path: Path, number: int, series: str) -> Any:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
         raise GcarError(f"{path.name} cannot be read back")
-    meta = FileMetaDataset()
-    meta.MediaStorageSOPClassUID = SecondaryCaptureImageStorage
-    meta.MediaStorageSOPInstanceUID = generate_uid()
-    meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    data = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
-    data.SOPClassUID = SecondaryCaptureImageStorage
-    data.SOPInstanceUID = meta.MediaStorageSOPInstanceUID
-    data.StudyInstanceUID, data.SeriesInstanceUID = generate_uid(), series
-    for keyword in (
-        "PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime",
-        "ReferringPhysicianName", "StudyID", "AccessionNumber", "PatientOrientation",
-    ):  # fmt: skip
-        setattr(data, keyword, "")
-    data.Modality, data.ConversionType, data.SeriesNumber = "OT", "WSD", 2
+    data = _new(SecondaryCaptureImageStorage, "OT", series, 2)
+    # An unpaired body part has no laterality, what a screen shows no orientation.
+    data.BodyPartExamined, data.PatientOrientation = "HEART", ""
     data.InstanceNumber, data.SeriesDescription = number, _OVERLAYS
-    data.BurnedInAnnotation = "NO"
-    equipment(data)
     data.Rows, data.Columns = picture.shape[:2]
     data.SamplesPerPixel, data.PhotometricInterpretation, data.PlanarConfiguration = 3, "RGB", 0
     data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
     pixels = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).tobytes()
     data.PixelData = pixels + b"\0" * (len(pixels) % 2)
+    return data
+
+
+def _page(path: Path) -> Any:
+    """Wrap a printed page as Encapsulated PDF."""
+    content = path.read_bytes()
+    if not content.startswith(b"%PDF-"):
+        raise GcarError(f"{path} is no PDF")
+    data = _new(EncapsulatedPDFStorage, "DOC", generate_uid(), 4)
+    data.SeriesDescription = data.DocumentTitle = _PAGE
+    # The page bears the name of its case, which may be a person's.
+    data.BurnedInAnnotation = "YES"
+    data.ContentDate = data.ContentTime = data.AcquisitionDateTime = ""
+    data.ConceptNameCodeSequence = []
+    data.MIMETypeOfEncapsulatedDocument = "application/pdf"
+    data.EncapsulatedDocumentLength = len(content)
+    data.EncapsulatedDocument = content + b"\0" * (len(content) % 2)
     return data

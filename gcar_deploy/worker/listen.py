@@ -37,10 +37,14 @@ _SECONDS = 60
 
 @dataclasses.dataclass(eq=False)
 class Study:
-    """Runs of one study that have arrived: SOP instance UID to file."""
+    """Runs of one study that have arrived: SOP instance UID to file.
+
+    ``told`` is how many there were when it was last said what the study waits for.
+    """
 
     scratch: Path
     runs: dict[str, Path] = dataclasses.field(default_factory=dict)
+    told: int = 0
 
 
 class Listener:
@@ -53,15 +57,24 @@ class Listener:
     title : application entity title that senders must call
     runs : a study is ordered when it has so many
     most_mib : the largest run
+    say : called with a sentence of what came and what a study waits for
     """
 
     def __init__(
-        self, queue: JobQueue, out: Path, *, title: str, runs: int = 2, most_mib: int = 512
+        self,
+        queue: JobQueue,
+        out: Path,
+        *,
+        title: str,
+        runs: int = 2,
+        most_mib: int = 512,
+        say: Callable[[str], None] | None = None,
     ) -> None:
         if not 2 <= runs <= MOST_VIEWS:
             raise UsageError(f"runs = {runs} must be 2 .. {MOST_VIEWS}")
         self._queue, self._out = queue, out
         self._title, self._wanted, self._most_bytes = title, runs, most_mib * 2**20
+        self._say = say or _log.info
         self._studies: dict[str, Study] = {}
         self._lock = threading.Lock()
         self._server: Any = None
@@ -123,7 +136,7 @@ class Listener:
                 return OUT_OF_RESOURCES
             path = found.runs.setdefault(instance, found.scratch / f"run{len(found.runs) + 1}.dcm")
             path.write_bytes(data)
-        _log.info("study %s: %s", study, path.name)
+        self._say(f"study {study}: {path.stem} received, {len(data) >> 10} KiB")
         return SUCCESS
 
     def _let_go(self, _: Any) -> None:
@@ -132,7 +145,13 @@ class Listener:
             ready = [uid for uid, s in self._studies.items() if len(s.runs) >= self._wanted]
             studies = {uid: self._studies.pop(uid) for uid in ready}
             for uid, study in studies.items():
+                self._say(f"study {uid}: {len(study.runs)} runs, reconstruction begins")
                 self._order(uid, study)
+            for uid, study in self._studies.items():
+                count = len(study.runs)
+                if count != study.told:
+                    study.told = count
+                    self._say(f"study {uid}: {count} of {self._wanted} runs; waits for more")
 
     def _order(self, uid: str, study: Study) -> None:
         order = Order(views=tuple(study.runs.values()), out=self._free(uid))

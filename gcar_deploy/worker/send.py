@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,13 +45,13 @@ def parse_peer(text: str) -> Peer:
     return Peer(found["title"], found["host"].strip("[]"), int(found["port"]))
 
 
-def sent_back(folder: Path, run: Path, peer: Peer, title: str) -> dict[str, Any]:
-    """Send a result folder's surface and overlays; what goes wrong is told, not raised.
+def sent_back(folder: Path, runs: Sequence[Path], peer: Peer, title: str) -> dict[str, Any]:
+    """Send a result's surface, overlays and measurements; what goes wrong is told, not raised.
 
     Parameters
     ----------
     folder : result folder
-    run : one of the study's runs
+    runs : of the study
     peer : who gets them
     title : our application entity title
 
@@ -59,7 +60,7 @@ def sent_back(folder: Path, run: Path, peer: Peer, title: str) -> dict[str, Any]
     ``sent`` (how many objects the peer took) and ``send_error`` (a sentence, or None)
     """
     try:
-        objects = study_objects(folder, run)
+        objects = list(study_objects(folder, runs).values())
         sent, error = _send(objects, peer, title)
     except GcarError as problem:
         return {"sent": 0, "send_error": str(problem)}

@@ -23,42 +23,29 @@ from pynetdicom import AE
 from gcar_deploy.cli.listen import listen
 from gcar_deploy.dicom.header import CLASSIC
 from gcar_deploy.errors import UsageError
-from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.selftest import tiny_tree
-from gcar_deploy.tubes.model import footprint, tubes_of
 from gcar_deploy.worker.jobs import JobQueue
 from gcar_deploy.worker.listen import Listener, tell
-from tests.dicom.files import classic, jpeg_lossless, save
+from tests.dicom.files import classic, jpeg_lossless
+from tests.dicom.made_result import named
 from tests.worker.conftest import dcmtk
 
 VERIFICATION = "1.2.840.10008.1.1"
-SIDE = 256
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Two X-ray pictures of a small tree as XA files of one study."""
-    folder, study = tmp_path_factory.mktemp("runs"), generate_uid()
-    rng = np.random.default_rng(0)
-    files = []
-    for number, (primary, secondary) in enumerate(((-30, -20), (45, 25)), start=1):
-        carm = CArm(
-            primary_angle_deg=primary, secondary_angle_deg=secondary, sod_mm=765.0, sdd_mm=1100.0,
-            rows=SIDE, columns=SIDE, pixel_spacing_mm=(0.6, 0.6),
-        )  # fmt: skip
-        path = footprint(tubes_of(tiny_tree()), carm, 1.0).image((SIDE, SIDE))
-        grey = 190 * np.exp(-0.22 * path) + rng.normal(0, 1.5, path.shape)
-        run = classic(
-            np.rint(grey).clip(0, 255).astype(np.uint8)[None], StudyInstanceUID=study,
-            SeriesInstanceUID=generate_uid(), PositionerPrimaryAngle=str(primary),
-            PositionerSecondaryAngle=str(secondary), ImagerPixelSpacing=["0.6", "0.6"],
-        )  # fmt: skip
-        files.append(save(run, folder / f"run{number}.dcm"))
-    return study, files
+    return named(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture
-def listening(tmp_path):
+def said():
+    """What the listener says."""
+    return []
+
+
+@pytest.fixture
+def listening(tmp_path, said):
     """(port, orders that came, out); the orders are not worked on."""
     orders, lines = [], []
 
@@ -67,7 +54,7 @@ def listening(tmp_path):
         return {"status": "ok"}, order.out
 
     queue = JobQueue(work, on_change=tell(lines.append))
-    listener = Listener(queue, tmp_path, title="GCAR", most_mib=1)
+    listener = Listener(queue, tmp_path, title="GCAR", most_mib=1, say=said.append)
     yield listener.start(0), orders, lines, queue
     listener.stop()
     queue.close()
@@ -107,7 +94,7 @@ def test_a_study_is_ordered_once_its_sender_lets_go(listening, runs, tmp_path):
     }  # fmt: skip
 
 
-def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, tmp_path):
+def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, said, tmp_path):
     port, orders, _, queue = listening
     study, files = runs
     (tmp_path / study).mkdir()
@@ -117,6 +104,10 @@ def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, tmp
         link.release()
     wait_for(queue, 1)
     assert orders[0][0] == tmp_path / f"{study}-2"
+    told = [line.removeprefix(f"study {study}: ").partition(",")[0] for line in said]
+    assert told == [
+        "run1 received", "1 of 2 runs; waits for more", "run2 received", "2 runs",
+    ]  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore:Invalid value for VR UI")

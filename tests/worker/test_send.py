@@ -18,46 +18,35 @@ pytest.importorskip("pynetdicom", reason="needs the listen extra")
 
 import pydicom
 from pydicom.uid import (
+    Comprehensive3DSRStorage,
     EncapsulatedSTLStorage,
     ExplicitVRLittleEndian,
     SecondaryCaptureImageStorage,
-    generate_uid,
 )
 from pynetdicom import AE, evt
 
 from gcar_deploy.errors import UsageError
-from gcar_deploy.selftest import tiny_tree
-from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 from gcar_deploy.worker.send import Peer, parse_peer, sent_back
-from tests.dicom.files import classic, save
+from tests.dicom.made_result import of_jane, result_of
 from tests.worker.conftest import dcmtk
 from tests.worker.test_listen import runs  # noqa: F401 - a fixture
 
-BOTH = (EncapsulatedSTLStorage, SecondaryCaptureImageStorage)
+pytest.importorskip("highdicom", reason="needs the sr extra")
+
+ALL = (EncapsulatedSTLStorage, SecondaryCaptureImageStorage, Comprehensive3DSRStorage)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """What of a result folder goes back."""
-    folder = tmp_path_factory.mktemp("result")
-    (folder / "surface.stl").write_bytes(stl_bytes(lumen_surface(tiny_tree())))
-    for k in (1, 2):
-        picture = np.random.default_rng(k).integers(0, 255, (33, 21, 3), np.uint8)
-        cv2.imwrite(str(folder / f"overlay_view{k}.png"), picture)
-    return folder
+def named_runs(tmp_path_factory):
+    return of_jane(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    data = classic(
-        np.zeros((1, 8, 8), np.uint8), StudyInstanceUID=generate_uid(),
-        SeriesInstanceUID=generate_uid(), PatientName="Doe^Jane",
-        PatientID="77", StudyDate="20240102", AccessionNumber="A9", OperatorsName="Not^Copied",
-    )  # fmt: skip
-    return save(data, tmp_path_factory.mktemp("run") / "run.dcm")
+def folder(named_runs, tmp_path_factory):
+    return result_of(named_runs, tmp_path_factory.mktemp("result") / "out")
 
 
-def archive(kinds=BOTH, status=0x0000):
+def archive(kinds=ALL, status=0x0000):
     """A storage service: (server, what it got)."""
     got = []
 
@@ -77,64 +66,65 @@ def archive(kinds=BOTH, status=0x0000):
     return server, got
 
 
-def sent_to(server, folder, run, title="ARCHIVE"):
+def sent_to(server, folder, named_runs, title="ARCHIVE"):
     try:
-        return sent_back(folder, run, Peer(title, "127.0.0.1", server.server_address[1]), "GCAR")
+        peer = Peer(title, "127.0.0.1", server.server_address[1])
+        return sent_back(folder, named_runs, peer, "GCAR")
     finally:
         server.shutdown()
 
 
-def test_surface_and_overlays_arrive_in_the_study_of_the_pictures(folder, run):
+def test_surface_and_overlays_arrive_in_the_study_of_the_pictures(folder, named_runs):
     server, got = archive()
-    assert sent_to(server, folder, run) == {"sent": 3, "send_error": None}
-    source = pydicom.dcmread(run)
-    assert [data.SOPClassUID for data in got] == [BOTH[0], BOTH[1], BOTH[1]]
+    assert sent_to(server, folder, named_runs) == {"sent": 4, "send_error": None}
+    source = pydicom.dcmread(named_runs[0])
+    assert [data.SOPClassUID for data in got] == [ALL[0], ALL[1], ALL[1], ALL[2]]
     for data in got:
         for keyword in ("PatientName", "PatientID", "StudyInstanceUID", "StudyDate",
                         "AccessionNumber"):  # fmt: skip
             assert data[keyword].value == source[keyword].value
         assert "OperatorsName" not in data
         assert data.SeriesInstanceUID not in (source.SeriesInstanceUID, "")
-    surface, first, second = got
+    surface, first, second, _ = got
     stl = (folder / "surface.stl").read_bytes()
     assert surface.EncapsulatedDocument[: surface.EncapsulatedDocumentLength] == stl
     assert first.SeriesInstanceUID == second.SeriesInstanceUID != surface.SeriesInstanceUID
     for data, name in ((first, "overlay_view1.png"), (second, "overlay_view2.png")):
         shown = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
         np.testing.assert_array_equal(data.pixel_array, shown[..., ::-1])
-    assert len({data.SOPInstanceUID for data in got}) == 3
+    assert len({data.SOPInstanceUID for data in got}) == 4
 
 
-def test_a_kind_that_the_peer_does_not_take_keeps_nothing_else_back(folder, run):
-    server, got = archive(kinds=BOTH[1:])
-    told = sent_to(server, folder, run)
-    assert told["sent"] == len(got) == 2
+def test_a_kind_that_the_peer_does_not_take_keeps_nothing_else_back(folder, named_runs):
+    server, got = archive(kinds=ALL[1:])
+    told = sent_to(server, folder, named_runs)
+    assert told["sent"] == len(got) == 3
     assert re.fullmatch(r"ARCHIVE@127\.0\.0\.1:\d+ does not take Encapsulated STL Storage",
                         told["send_error"])  # fmt: skip
 
 
-def test_refusals_are_one_sentence(folder, run):
+def test_refusals_are_one_sentence(folder, named_runs):
     server, _ = archive(status=0xA700)
-    told = sent_to(server, folder, run)
+    told = sent_to(server, folder, named_runs)
     assert told["sent"] == 0 and told["send_error"].endswith(
         "refuses Encapsulated STL Storage (status 0xA700)"
     )
     server, got = archive()
-    told = sent_to(server, folder, run, title="SOMEONE")
+    told = sent_to(server, folder, named_runs, title="SOMEONE")
     assert not got and told["send_error"].endswith("refuses the association")
     # Bound, not listening: nobody else can take the port meanwhile.
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         peer = Peer("ARCHIVE", "127.0.0.1", taken.getsockname()[1])
-        assert sent_back(folder, run, peer, "GCAR") == {
+        assert sent_back(folder, named_runs, peer, "GCAR") == {
             "sent": 0, "send_error": f"{peer} cannot be reached"
         }  # fmt: skip
 
 
-def test_a_result_that_cannot_be_read_back_is_said(tmp_path, run):
+def test_a_result_that_cannot_be_read_back_is_said(tmp_path, named_runs):
     server, _ = archive()
-    told = sent_to(server, tmp_path, run)
-    assert told["sent"] == 0 and "cannot be read back" in told["send_error"]
+    told = sent_to(server, tmp_path, named_runs)
+    assert told["sent"] == 0 and "result.json" in told["send_error"]
 
 
 @pytest.mark.parametrize(
@@ -206,9 +196,9 @@ def test_from_storescu_to_storescp(runs, tmp_path, maker):  # noqa: F811
     told = json.loads(out)
     assert listener.returncode == 0, err
     assert told["study"] == study and told["state"] == "done", told
-    assert (told["sent"], told["send_error"]) == (3, None), err
+    assert (told["sent"], told["send_error"]) == (4, None), err
     assert [path.name for path in (tmp_path / "out").iterdir()] == [study]
     assert (tmp_path / "out" / study / "report.html").is_file()
     stored = [pydicom.dcmread(path) for path in (tmp_path / "archive").iterdir()]
-    assert sorted(data.SOPClassUID for data in stored) == sorted([BOTH[1], BOTH[1], BOTH[0]])
+    assert sorted(data.SOPClassUID for data in stored) == sorted([*ALL, ALL[1]])
     assert {data.StudyInstanceUID for data in stored} == {study}

@@ -1,0 +1,149 @@
+"""Result as DICOM objects: what another reader finds in them, and what a validator says."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pydicom", reason="needs the dicom extra")
+pytest.importorskip("highdicom", reason="needs the sr extra")
+
+import highdicom as hd
+import pydicom
+from pydicom.sr.codedict import codes
+
+from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.output.dicom_study import file_bytes, study_objects
+from gcar_deploy.output.stored import read_folder
+from tests.cli.conftest import gcar
+from tests.dicom.made_result import named, of_jane, result_of
+
+PDF = b"%PDF-1.4\n1 0 obj << >> endobj\ntrailer << >>\n%%EOF"
+VALIDATOR = shutil.which("dciodvfy")
+#: what only the archive knows, or each maker names for itself
+_NO_ERROR = ("99GCAR", "DICOMDIR")
+
+
+@pytest.fixture(scope="module")
+def jane(tmp_path_factory):
+    return of_jane(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module")
+def result(jane, tmp_path_factory):
+    return result_of(jane, tmp_path_factory.mktemp("result") / "out")
+
+
+@pytest.fixture(scope="module")
+def archive(result, jane, tmp_path_factory):
+    """Folder that ``gcar dicom`` wrote."""
+    room = tmp_path_factory.mktemp("archive")
+    (room / "p.pdf").write_bytes(PDF)
+    done = gcar("dicom", result, *jane, "--pdf", room / "p.pdf", "--out", room / "out")
+    assert done.code == 0, done.err
+    return room / "out"
+
+
+def test_every_object_belongs_to_the_study_and_names_its_patient(archive, jane):
+    run = pydicom.dcmread(jane[0])
+    found = {path.name: pydicom.dcmread(path) for path in archive.glob("*.dcm")}
+    assert sorted(found) == ["measurements.dcm", "overlay_view1.dcm", "overlay_view2.dcm",
+                             "page.dcm", "surface.dcm"]  # fmt: skip
+    for data in found.values():
+        for keyword in ("PatientName", "PatientID", "StudyInstanceUID", "StudyDate",
+                        "AccessionNumber"):  # fmt: skip
+            assert data[keyword].value == run[keyword].value
+        assert data.SeriesInstanceUID != run.SeriesInstanceUID and "OperatorsName" not in data
+    page = found["page.dcm"]
+    assert page.EncapsulatedDocument[: page.EncapsulatedDocumentLength] == PDF
+    assert len({data.SeriesInstanceUID for data in found.values()}) == 4
+
+
+def test_the_report_says_what_the_result_says_and_where(archive, result, jane):
+    """Read back by highdicom: one group a branch, values of result.json, points on the line."""
+    report = hd.sr.srread(archive / "measurements.dcm")
+    stored = read_folder(result)
+    groups = report.content.get_image_measurement_groups()
+    rows = stored.summary["tree"]["branches"]
+    assert len(groups) == len(rows) > 1
+    points = 0
+    for k, (group, row) in enumerate(zip(groups, rows, strict=True)):
+        assert group.tracking_identifier.split(",")[0] == f"branch {k + 1}"
+        for code, key in (
+            (codes.SCT.LumenDiameterStenosis, "stenosis_percent"),
+            (codes.SCT.LumenAreaStenosis, "area_stenosis_percent"),
+            (codes.SCT.LengthOfVesselSegment, "length_mm"),
+        ):
+            told = [m.value for m in group.get_measurements(code)]
+            assert told == ([] if row[key] is None else [pytest.approx(row[key], abs=6e-4)])
+        diameters = {
+            m.finding_sites[0].topographical_modifier.value: m
+            for m in group.get_measurements(codes.SCT.VesselLumenDiameter)
+        }
+        assert ("122382" in diameters) == (row["minimal_diameter_mm"] is not None)
+        for measured in diameters.values():
+            (place,) = measured.referenced_coordinates
+            gap = np.linalg.norm(stored.tree.branches[k].points_mm - place.value, axis=1).min()
+            assert gap < 0.5
+            points += 1
+        if "122382" in diameters:
+            least = diameters["122382"]
+            assert least.value == pytest.approx(row["minimal_diameter_mm"], abs=6e-4)
+            branch = stored.tree.branches[k]
+            near = np.linalg.norm(branch.points_mm - least.referenced_coordinates[0].value, axis=1)
+            assert abs(branch.arc_mm[near.argmin()] - row["minimal_at_mm"]) < 0.6
+    assert points
+    said = [
+        item.TextValue
+        for item in report.ContentSequence
+        if (item.ValueType, item.RelationshipType) == ("TEXT", "CONTAINS")
+    ]
+    assert said[0] == "{status}: {sentence}".format(**stored.summary)
+    assert "Research use only" in said[-1]
+    assert report.VerificationFlag == "UNVERIFIED"
+    evidence = report.CurrentRequestedProcedureEvidenceSequence[0].ReferencedSeriesSequence
+    told = {s.ReferencedSOPInstanceUID for series in evidence for s in series.ReferencedSOPSequence}
+    assert told == {pydicom.dcmread(run).SOPInstanceUID for run in jane}
+    surface = pydicom.dcmread(archive / "surface.dcm")
+    first = next(iter(groups[0].get_measurements(codes.SCT.VesselLumenDiameter)))
+    assert first.referenced_coordinates[0].frame_of_reference_uid == surface.FrameOfReferenceUID
+
+
+@pytest.mark.skipif(VALIDATOR is None, reason="needs dciodvfy of dicom3tools")
+def test_a_validator_finds_no_fault(archive):
+    for path in sorted(archive.glob("*.dcm")):
+        told = subprocess.run([VALIDATOR, str(path)], capture_output=True, text=True, check=False)
+        faults = [
+            line
+            for line in told.stderr.splitlines()
+            if line.startswith(("Error", "Warning")) and not any(w in line for w in _NO_ERROR)
+        ]
+        assert not faults, (path.name, faults)
+
+
+def test_nobody_elses_study_gets_the_result(result, jane, tmp_path):
+    _, others = named(tmp_path, side=240)
+    with pytest.raises(UsageError, match=r"run1\.dcm is none of the files that the result"):
+        study_objects(result, [others[0], jane[1]])
+    with pytest.raises(UsageError, match="1 runs: the result has 2"):
+        study_objects(result, jane[:1])
+    (tmp_path / "x.pdf").write_bytes(b"PDF")
+    with pytest.raises(GcarError, match=r"x\.pdf is no PDF"):
+        study_objects(result, jane, tmp_path / "x.pdf")
+    with pytest.raises(GcarError, match=r"none\.pdf cannot be read"):
+        study_objects(result, jane, tmp_path / "none.pdf")
+    done = gcar("dicom", result, tmp_path / "none.dcm", jane[0], "--out", tmp_path / "o")
+    assert done.code == 3 and "none.dcm cannot be read as DICOM" in done.err
+    assert not (tmp_path / "o").exists()
+
+
+def test_captures_hold_the_overlays_pixels(result, jane):
+    import cv2
+
+    made = study_objects(result, jane)
+    again = pydicom.dcmread(pydicom.filebase.DicomBytesIO(file_bytes(made["overlay_view2.dcm"])))
+    shown = cv2.imread(str(result / "overlay_view2.png"), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(again.pixel_array, shown[..., ::-1])
