@@ -25,6 +25,7 @@ VERBS = {
         "Tell the pressure drop at an assumed flow; files for solvers.",
     ),
     "dicom": ("gcar_deploy.cli.dicom", "Write a result as DICOM: report, captures, surface."),
+    "slicer": ("gcar_deploy.cli.slicer", "Write a scene of a result for 3D Slicer."),
     "demo": ("gcar_deploy.cli.demo", "Reconstruct the case that comes along."),
     "batch": ("gcar_deploy.cli.batch", "Reconstruct every case of a table."),
     "serve": ("gcar_deploy.cli.serve", "Keep a warm engine for host programs."),

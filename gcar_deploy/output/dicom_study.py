@@ -17,6 +17,7 @@ import cv2
 import pydicom
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import (
+    UID,
     EncapsulatedPDFStorage,
     ExplicitVRLittleEndian,
     SecondaryCaptureImageStorage,
@@ -116,7 +117,7 @@ def _as_stored(data: Any) -> Any:
     return pydicom.dcmread(io.BytesIO(file_bytes(data)))
 
 
-def _new(kind: str, modality: str, series: str, number: int) -> Any:
+def _new(kind: UID, modality: str, series: str, number: int) -> Any:
     """Return a data set with the modules that all share, empty where the run fills them in."""
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = kind
