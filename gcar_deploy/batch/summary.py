@@ -4,39 +4,39 @@ from __future__ import annotations
 
 import base64
 import csv
-import hashlib
 import html
 import io
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from gcar_deploy.batch.work import COLUMNS
+from gcar_deploy.output.report import page_policy
 from gcar_deploy.reconstruction import RESEARCH_USE
 
-_STYLE = """
-body { margin: 0 auto; max-width: 1280px; padding: 16px; color: #1c2430; background: #f5f7fa;
-  font: 15px/1.45 system-ui, sans-serif; }
-table { border-collapse: collapse; width: 100%; background: #fff; font-size: 14px;
-  font-variant-numeric: tabular-nums; }
-th, td { padding: 6px 10px; border-bottom: 1px solid #d9dee6; text-align: right; }
-th:first-child, td:first-child, .words { text-align: left; overflow-wrap: anywhere; }
-td.ok { color: #1d6b41; } td.degraded { color: #9a6200; }
-td.refused, td.failed { color: #b03024; }
-p { color: #5b6675; }
-"""
+_TEMPLATE = "summary_template.html"
+#: key, heading, unit, decimals (None: words)
 _SHOWN = (
-    ("status", "Status", ""), ("branches", "Branches", ""), ("length_mm", "Length", " mm"),
-    ("separation_deg", "View separation", " deg"), ("least_coverage", "Least coverage", ""),
-    ("largest_stenosis_percent", "Largest stenosis", " %"), ("seconds", "Time", " s"),
-    ("sentence", "Why", ""),
+    ("status", "Status", "", None), ("branches", "Branches", "", 0),
+    ("length_mm", "Length", "mm", 0), ("separation_deg", "View separation", "deg", 0),
+    ("least_coverage", "Least coverage", "%", 0),
+    ("largest_stenosis_percent", "Largest stenosis", "%", 0), ("seconds", "Time", "s", 1),
+    ("sentence", "Why", "", None),
 )  # fmt: skip
+#: shares are shown in percent
+_FACTORS = {"least_coverage": 100.0}
+#: pictures of a case beside its name, pixels high
+_THUMBNAILS, _THUMBNAIL_PX = 2, 96
 
 
 def write_summary(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
     """Write both files; an earlier summary of the same batch is replaced."""
-    for name, text in (("summary.csv", summary_csv(rows)), ("summary.html", summary_html(rows))):
+    page = summary_html(rows, out)
+    for name, text in (("summary.csv", summary_csv(rows)), ("summary.html", page)):
         partial = out / f"{name}.partial"
         partial.write_text(text, encoding="utf-8", newline="")
         partial.replace(out / name)
@@ -52,35 +52,77 @@ def summary_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def summary_html(rows: Sequence[Mapping[str, Any]]) -> str:
-    """One page with a line a case, linked to its report; no script, nothing fetched."""
+def summary_html(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
+    """One page with a line a case, linked to its report; sorted and filtered by the page itself.
+
+    Parameters
+    ----------
+    rows : one a case
+    out : folder of the batch, whose cases' overlays are shown small
+
+    Returns
+    -------
+    HTML text; script and style inside, allowed by their hashes and nothing else
+    """
+    template = resources.files("gcar_deploy.batch").joinpath(_TEMPLATE).read_text("utf-8")
     counts = Counter(str(row["status"]) for row in rows)
     said = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
-    digest = base64.b64encode(hashlib.sha256(_STYLE.encode()).digest()).decode("ascii")
-    head = "".join(
-        f'<th class="words">{name}</th>' if key == "sentence" else f"<th>{name}</th>"
-        for key, name, _ in _SHOWN
-    )
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
-        f"style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'\">"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{len(rows)} cases: {html.escape(said)}</title><style>{_STYLE}</style></head>"
-        f"<body><h1>{len(rows)} cases: {html.escape(said)}</h1>"
-        f"<table><thead><tr><th>Case</th>{head}</tr></thead><tbody>"
-        f"{''.join(_line(row) for row in rows)}</tbody></table>"
-        f"<p>{html.escape(RESEARCH_USE)}</p></body></html>\n"
-    )
+    parts = {
+        "TITLE": html.escape(f"{len(rows)} cases: {said}" if rows else "no cases"),
+        "HEAD": _head("Case", "", "words") + "<th><span>Views</span></th>"
+        + "".join(
+            _head(name, unit, "words" if digits is None else "") for _, name, unit, digits in _SHOWN
+        ),
+        "ROWS": "".join(_line(row, out) for row in rows),
+        "USE": html.escape(RESEARCH_USE),
+    }  # fmt: skip
+    page = re.sub("__([A-Z]+)__", lambda mark: parts.get(mark[1], mark[0]), template)
+    return page.replace("__CSP__", page_policy(page), 1)
 
 
-def _line(row: Mapping[str, Any]) -> str:
-    name = html.escape(str(row["case"]))
+def _head(name: str, unit: str, kind: str) -> str:
+    small = f"<small>{unit}</small>" if unit else ""
+    return f'<th scope="col" class="{kind}"><button type="button">{name}</button>{small}</th>'
+
+
+def _line(row: Mapping[str, Any], out: Path) -> str:
+    name, status = html.escape(str(row["case"])), html.escape(str(row["status"]))
     done = row["status"] in ("ok", "degraded")
-    cells = [f'<td><a href="{name}/report.html">{name}</a></td>' if done else f"<td>{name}</td>"]
-    for key, _, unit in _SHOWN:
+    link = f'<a href="{html.escape(quote(str(row["case"])))}/report.html">{name}</a>'
+    pictures = _thumbnails(out / str(row["case"])) if done else ""
+    cells = [
+        f'<td class="name words" data-value="{name}">{link if done else name}</td>',
+        f'<td class="pictures">{pictures}</td>',
+    ]
+    for key, title, unit, digits in _SHOWN:
         value = row.get(key)
-        text = "-" if value is None else f"{value:g}{unit}" if isinstance(value, float) else value
-        kind = {"status": html.escape(str(value)), "sentence": "words"}.get(key, "")
-        cells.append(f'<td class="{kind}">{html.escape(str(text))}</td>')
-    return f"<tr>{''.join(cells)}</tr>"
+        if digits is None:
+            kind = f"status {status}" if key == "status" else "why words"
+            text = html.escape("-" if value is None else str(value))
+            cells.append(f'<td class="{kind}" data-value="{text}">{text}</td>')
+        elif value is None:
+            cells.append(f'<td class="number" data-name="{title}">-</td>')
+        else:
+            number = _FACTORS.get(key, 1.0) * float(value)
+            told = f'data-name="{title}{f", {unit}" if unit else ""}" data-value="{number:.6g}"'
+            cells.append(f'<td class="number" {told}>{number:.{digits}f}</td>')
+    return f'<tr data-status="{status}">{"".join(cells)}</tr>'
+
+
+def _thumbnails(folder: Path) -> str:
+    """Return small overlays of a result folder, as part of the page; nothing where it is gone."""
+    import cv2
+
+    found = []
+    for k in range(1, _THUMBNAILS + 1):
+        # Decoded at a quarter of the size: a page of many cases is made in a moment.
+        picture = cv2.imread(str(folder / f"overlay_view{k}.png"), cv2.IMREAD_REDUCED_COLOR_4)
+        if picture is None:
+            continue
+        scale = _THUMBNAIL_PX / picture.shape[0]
+        size = (max(1, round(scale * picture.shape[1])), _THUMBNAIL_PX)
+        small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
+        text = base64.b64encode(data).decode("ascii")
+        found.append(f'<img alt="view {k}" src="data:image/jpeg;base64,{text}">')
+    return "".join(found)

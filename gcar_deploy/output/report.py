@@ -76,11 +76,11 @@ def report_html(
     }
     # One pass: a name of a view that looks like a mark is text.
     page = re.sub("__([A-Z]+)__", lambda mark: parts.get(mark[1], mark[0]), template)
-    return page.replace("__CSP__", _policy(page), 1)
+    return page.replace("__CSP__", page_policy(page), 1)
 
 
-def _policy(page: str) -> str:
-    """Content security policy: only the scripts and styles of this very page."""
+def page_policy(page: str) -> str:
+    """Return the content security policy: only the scripts and styles of this very page."""
 
     def hashes(tag: str) -> str:
         bodies = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)

@@ -8,6 +8,8 @@ import json
 import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from gcar_deploy.batch import pools, work
@@ -194,12 +196,14 @@ def test_nothing_of_the_users_is_touched(table, tmp_path):
     assert [p.name for p in out.iterdir()] == ["thesis.txt"]
 
 
-def test_the_summary_page_fetches_nothing_and_runs_nothing():
+def test_the_summary_page_fetches_nothing_and_runs_its_own_script_alone(tmp_path):
     rows = [
         {**work.error_row("a", "ok", "fine", 0), "length_mm": 12.5},
         work.error_row("b", "failed", "<script>alert(1)</script>", 1),
     ]
-    page = summary_html(rows)
+    (tmp_path / "a").mkdir()
+    cv2.imwrite(str(tmp_path / "a" / "overlay_view1.png"), np.full((200, 100, 3), 90, np.uint8))
+    page = summary_html(rows, tmp_path)
     tags = []
 
     class Reader(html.parser.HTMLParser):
@@ -207,9 +211,13 @@ def test_the_summary_page_fetches_nothing_and_runs_nothing():
             tags.append((tag, dict(attrs)))
 
     Reader().feed(page)
-    assert not any(tag in ("script", "img", "link", "iframe") for tag, _ in tags)
-    assert [a["href"] for tag, a in tags if tag == "a"] == ["a/report.html"]
-    assert "12.5 mm" in page and "1 failed, 1 ok" in page
+    named = [value for _, attrs in tags for key, value in attrs.items() if key in ("src", "href")]
+    assert sum(value.startswith("data:image/jpeg") for value in named) == 1
+    assert [value for value in named if not value.startswith("data:")] == ["a/report.html"]
+    assert [tag for tag, _ in tags].count("script") == 1 and "alert(1)" in page
+    policy = next(a["content"] for t, a in tags if a.get("http-equiv"))
+    assert "default-src 'none'" in policy and "unsafe" not in policy
+    assert ">12<" in page and "1 failed, 1 ok" in page
     assert summary_csv(rows).splitlines()[1].startswith("a,ok,0,fine,")
 
 
