@@ -17,7 +17,13 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.vessels import find_vessels
-from gcar_deploy.measure import from_inlets, measure_sections, read_signal, with_diameters
+from gcar_deploy.measure import (
+    from_inlets,
+    joined_over_lesions,
+    measure_sections,
+    read_signal,
+    with_diameters,
+)
 from gcar_deploy.pose import landmark_pixels, marked_places, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import check_candidates, check_tree, check_views, judge
@@ -120,6 +126,8 @@ def _reconstructed(
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(),
         ).or_fail()  # fmt: skip
+        signals = [read_signal(a, v) for a, v in zip(angiograms, placed.views, strict=True)]
+        refined = refined.with_tree(joined_over_lesions(refined.tree, signals))
         refined, missed = refined.without(options.deleted_mm)
         keep(refined)
     with watch.stage("tree", keep_if_late=True):
@@ -136,7 +144,6 @@ def _reconstructed(
             disagreement=placed.disagreement, evidence=centers.evidence,
         )  # fmt: skip
     with watch.stage("diameters", keep_if_late=True):
-        signals = [read_signal(a, v) for a, v in zip(angiograms, placed.views, strict=True)]
         sections = measure_sections(tree, signals)
         tree = with_diameters(tree, sections)
     return Reconstruction(

@@ -1,5 +1,6 @@
 """What is measured of a finished tree: inlets, lumen, names, angles, the view to take next."""
 
+from gcar_deploy.measure.bridges import joined_over_lesions
 from gcar_deploy.measure.inlet import from_inlets
 from gcar_deploy.measure.measured import Measured, measured
 from gcar_deploy.measure.naming import BranchName
@@ -11,6 +12,7 @@ __all__ = [
     "Measured",
     "Sections",
     "from_inlets",
+    "joined_over_lesions",
     "measure_sections",
     "measured",
     "read_signal",

@@ -48,16 +48,19 @@ GROUND_MM = 0.03
 MODEL_SD = 0.03
 #: neighbouring sections read the same pixels: so many count as one; anatomy behind the vessels of
 #: grey pictures makes far more of them err together
-CORRELATED, CORRELATED_GREY = 2.0, 8.0
+CORRELATED, CORRELATED_GREY = 2.0, 16.0
 #: error of the vessel's direction, which the path along a slanting ray magnifies, rad
 TILT_SD = 0.07
 #: foreshortened: the ray runs within this angle of the vessel (sine); overlapped: this share of
 #: the lumen lies in another vessel's shadow
 SHORT_SINE, OVERLAP_SHARE = 0.5, 0.3
+#: error of a log radius that one view alone shows: another vessel, or an axis that is off, would
+#: not be noticed
+ALONE_SD = 0.2
 #: sections where no view knows the log radius better than this are not measured
 UNKNOWN_SD_LOG = 0.25
 #: walk of the log radius along a vessel: scale, 1 / sqrt(mm), Student's degrees of freedom
-WALK, FREEDOM = 0.12, 3.0
+WALK, FREEDOM = 0.2, 3.0
 #: the tubes' own radius counts for so little
 TUBE_SD = 0.5
 
@@ -360,6 +363,8 @@ def _joined(places: _Places, own: Array, seen: Sequence[_Seen]) -> Sections:
     arc = places.arc_mm[own]
     value = np.stack([view.log_radius[own] for view in seen])
     sd = np.stack([view.sd[own] for view in seen])
+    alone = np.count_nonzero(sd < UNKNOWN_SD_LOG, axis=0) < min(len(seen), 2)
+    sd = np.hypot(sd, ALONE_SD * alone)
     start = np.log(places.radius_mm[own])
     stiff = 1.0 / (WALK**2 * np.maximum(np.diff(arc), 1e-3))
     x, n = start.copy(), len(arc)

@@ -112,10 +112,16 @@ class Refined:
             tree = left or tree
         if tree is self.tree:
             return self, missed
-        gaussians = gaussians_on_tree(tree)
         if self.refiner == "paper":
             gaussians = _nearer_to(tree, self.tree, self.gaussians)
-        return dataclasses.replace(self, tree=tree, gaussians=gaussians), missed
+            return dataclasses.replace(self, tree=tree, gaussians=gaussians), missed
+        return self.with_tree(tree), missed
+
+    def with_tree(self, tree: Tree) -> Refined:
+        """Return the outcome with another tree, and the Gaussians on it where they go by it."""
+        if tree is self.tree or self.refiner == "paper":
+            return dataclasses.replace(self, tree=tree)
+        return dataclasses.replace(self, tree=tree, gaussians=gaussians_on_tree(tree))
 
     def or_fail(self) -> Refined:
         """Return itself; raise NumericalError where the refinement failed."""

@@ -81,6 +81,8 @@ def test_another_vessel_in_front_is_marked_and_does_no_harm():
     first, _ = measure_sections(both, signals_of(both))
     crossing = np.argmin(np.abs(first.arc_mm - ARC[60]))
     assert first.overlapped[0, crossing] and not first.overlapped[1, crossing]
+    # What one view alone says is trusted less.
+    assert first.sigma_mm[crossing] > 2 * np.median(first.sigma_mm)
     assert np.isnan(first.width_mm[0, crossing]) and np.isfinite(first.width_mm[1, crossing])
     assert np.abs(first.diameter_mm[8:-8] - 3.0).max() < 0.15
     away = slice(8, crossing - 12)

@@ -1,0 +1,229 @@
+"""Ends that face each other over a lesion so narrow that no vessel was found in it.
+
+A severe stenosis hides from the extraction of vessels, and the tree is broken where it matters
+most. Two free ends of different parts become one vessel again where each points at the other over
+a short gap, and where every view's own pixels show a line of contrast along the bridge that no
+line beside it comes near. A gap in which nothing is seen stays one: an occlusion is no stenosis.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from gcar_deploy.measure.signals import Signal
+from gcar_deploy.tree.edit import merged
+from gcar_deploy.tree.tree import Branch, Tree, along, polyline_arc
+from gcar_deploy.types import Array, Points, Scalars
+
+#: longest gap, mm, and the angle by which either end may point beside the other, degrees
+MOST_GAP_MM, MOST_TURN_DEG = 15.0, 40.0
+#: an end's direction is taken over so much of its branch, mm
+DIRECTION_MM = 4.0
+#: a shorter piece bridges nothing, mm: scraps point anywhere
+LEAST_PIECE_MM = 8.0
+#: the bridge is looked at in blocks of this length; in each the line may be so far off, mm
+BLOCK_MM, OFF_MM = 2.0, 0.8
+#: half-width of the line looked for, and how far beside it others are tried, mm
+HALF_MM, BESIDE_MM = 0.35, 5.0
+#: contrast over its spread beside the bridge from which it is seen: in each view, in their mean
+LEAST_Z, MEAN_Z = 1.5, 3.0
+#: ... and over that of the ends; their round caps and blur reach so many radii into the gap
+LEAST_LEVEL, CAP_RADII = 0.03, 1.5
+#: a lumen is no less than this share of what the ends are
+LEAST_SHARE = 0.1
+_STEP_MM = 0.2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _End:
+    """A free end: node, branch, number of its point, place, direction outwards, widest radius."""
+
+    node: int
+    branch: int
+    point: int
+    place: Points
+    outwards: Points
+    radius_mm: float
+
+
+def joined_over_lesions(tree: Tree, signals: Sequence[Signal]) -> Tree:
+    """Join free ends that face each other where every view shows a thin vessel between.
+
+    Parameters
+    ----------
+    tree : Tree, mm LPS
+    signals : of each view (``measure.signals``); masks show nothing in a gap, and join none
+
+    Returns
+    -------
+    Tree, the same one where nothing is joined
+    """
+    if not tree.branches:
+        return tree
+    ends, component = _free_ends(tree), tree.components()
+    wanted = [
+        (float(np.linalg.norm(b.place - a.place)), a, b)
+        for a, b in itertools.combinations(ends, 2)
+        if component[a.node] != component[b.node] and _face(a, b)
+    ]
+    used: set[int] = set()
+    bridges = []
+    for _, a, b in sorted(wanted, key=lambda item: item[0]):
+        if component[a.node] == component[b.node] or {a.node, b.node} & used:
+            continue
+        line = _curve(a, b)
+        radius = _radii(line, a, b, signals)
+        if radius is None:
+            continue
+        used |= {a.node, b.node}
+        component[component == component[b.node]] = component[a.node]
+        bridges.append(_bridge(tree, a, b, line, radius))
+    if not bridges:
+        return tree
+    return merged(dataclasses.replace(tree, branches=(*tree.branches, *bridges)))
+
+
+def _free_ends(tree: Tree) -> list[_End]:
+    degrees, out = tree.degrees, []
+    for k, branch in enumerate(tree.branches):
+        if branch.length_mm < LEAST_PIECE_MM:
+            continue
+        arc = branch.arc_mm
+        for point, node, inner in (
+            (0, branch.start, DIRECTION_MM),
+            (-1, branch.end, arc[-1] - DIRECTION_MM),
+        ):
+            if degrees[node] == 1:
+                way = branch.points_mm[point] - along(branch.points_mm, arc, np.array(inner))
+                way /= max(float(np.linalg.norm(way)), 1e-9)
+                near = np.abs(arc - arc[point]) <= DIRECTION_MM
+                radius = float(branch.radius_mm[near].max())
+                out.append(_End(node, k, point, branch.points_mm[point], way, radius))
+    return out
+
+
+def _face(a: _End, b: _End) -> bool:
+    way = b.place - a.place
+    gap = float(np.linalg.norm(way))
+    if not 0 < gap <= MOST_GAP_MM or max(a.radius_mm, b.radius_mm) > 2 * min(
+        a.radius_mm, b.radius_mm
+    ):
+        return False
+    least = np.cos(np.radians(MOST_TURN_DEG))
+    return bool(a.outwards @ way >= least * gap and -(b.outwards @ way) >= least * gap)
+
+
+def _curve(a: _End, b: _End) -> Points:
+    """(m, 3) Hermite's cubic from one end to the other."""
+    gap = float(np.linalg.norm(b.place - a.place))
+    t = np.linspace(0, 1, max(5, int(np.ceil(gap / 0.5)) + 1))[:, None]
+    out: Points = (
+        (2 * t**3 - 3 * t**2 + 1) * a.place + (t**3 - 2 * t**2 + t) * gap * a.outwards
+        + (3 * t**2 - 2 * t**3) * b.place - (t**3 - t**2) * gap * b.outwards
+    )  # fmt: skip
+    return out
+
+
+def _radii(line: Points, a: _End, b: _End, signals: Sequence[Signal]) -> Scalars | None:
+    """(m,) radius along a bridge by the contrast against the ends; None where it is not seen."""
+    seen = [found for signal in signals if (found := _seen(line, a, b, signal)) is not None]
+    if len(seen) < len(signals):
+        return None
+    clear = np.array([z for z, _ in seen])
+    if clear.min() < LEAST_Z or clear.mean() < MEAN_Z:
+        return None
+    share = np.clip(np.mean([level for _, level in seen], axis=0), LEAST_SHARE, 1.0)
+    out: Scalars = share * np.linspace(a.radius_mm, b.radius_mm, len(line))
+    return out
+
+
+def _seen(line: Points, a: _End, b: _End, signal: Signal) -> tuple[float, Scalars] | None:
+    """Contrast over its spread beside the bridge, and (m,) over that of the ends; None without."""
+    if signal.kind == "mask":
+        return None
+    # The ends' own vessel gives the scale.
+    before, after = _back(a), _back(b)
+    whole = np.concatenate([before, line, after[::-1]])
+    contrast = _contrast(whole, signal)
+    if contrast is None:
+        return None
+    n = len(before)
+    offsets = (np.arange(contrast.shape[1]) - contrast.shape[1] // 2) * _STEP_MM
+    own = np.abs(offsets) <= OFF_MM + 1e-9
+    scale = float(np.median(contrast[:n][:, own].max(axis=1)))
+    scale = min(scale, float(np.median(contrast[-n:][:, own].max(axis=1))))
+    if not scale > 0:
+        return None
+    # The ends' own round caps reach into the gap.
+    arc = polyline_arc(line)
+    low = min(CAP_RADII * a.radius_mm, arc[-1] / 3)
+    high = max(arc[-1] - CAP_RADII * b.radius_mm, arc[-1] * 2 / 3)
+    gap = (arc >= low) & (arc <= high)
+    inner, arc_inner = contrast[n:-n][gap], arc[gap]
+    count = max(int((high - low) / BLOCK_MM), 1)
+    block = np.minimum(((arc_inner - low) / (high - low) * count).astype(int), count - 1)
+    means = np.stack([inner[block == k].mean(axis=0) for k in range(count)])
+    width = round(OFF_MM / _STEP_MM)
+    best = np.stack([means[:, k - width : k + width + 1].max(axis=1)
+                     for k in range(width, means.shape[1] - width)])  # fmt: skip
+    total = best.mean(axis=1)
+    middle = len(total) // 2
+    beside = np.abs(np.arange(len(total)) - middle) * _STEP_MM > 2 * OFF_MM + HALF_MM
+    spread = 1.4826 * float(np.median(np.abs(total[beside] - np.median(total[beside]))))
+    level = (best[middle] - np.median(total[beside])) / scale
+    if level.mean() < LEAST_LEVEL:
+        return None
+    out: Scalars = np.interp(arc, [arc_inner[block == k].mean() for k in range(count)], level)
+    return float((total[middle] - np.median(total[beside])) / max(spread, 1e-9)), out
+
+
+def _back(end: _End) -> Points:
+    """(4, 3) places on the vessel before an end."""
+    return end.place - np.linspace(DIRECTION_MM, 1.0, 4)[:, None] * end.outwards
+
+
+def _contrast(line: Points, signal: Signal) -> Array | None:
+    """(m, k) signal on a line beside the axis less that on either side of it; None if unseen."""
+    carm = signal.carm
+    pixels, depth = carm.project(line)
+    if not (depth > 1.0).all():
+        return None
+    ahead = np.gradient(pixels, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    per_mm = np.sqrt(np.prod(carm.focal_px)) / depth
+    far = BESIDE_MM + OFF_MM + 4 * HALF_MM
+    count = int(np.ceil(far / _STEP_MM))
+    x = np.arange(-count, count + 1) * _STEP_MM
+    value, shown = signal.at(pixels[:, None] + (x * per_mm[:, None])[:, :, None] * across[:, None])
+    if not shown.all():
+        return None
+    value = signal.laws[len(signal.laws) // 2](value)
+    half = round(HALF_MM / _STEP_MM)
+    kernel = np.ones(2 * half + 1) / (2 * half + 1)
+    mean = np.apply_along_axis(np.convolve, 1, value, kernel, mode="same")
+    side = 3 * half + 1
+    out: Array = mean - 0.5 * (np.roll(mean, side, axis=1) + np.roll(mean, -side, axis=1))
+    return out[:, side + half : -(side + half)]
+
+
+def _bridge(tree: Tree, a: _End, b: _End, line: Points, radius_mm: Scalars) -> Branch:
+    """Return the branch between two ends; nobody fitted its place."""
+    first, second = tree.branches[a.branch], tree.branches[b.branch]
+    m, own = len(line), OFF_MM * np.sin(np.linspace(0, np.pi, len(line)))
+    sigma = np.linspace(first.sigma_mm[a.point], second.sigma_mm[b.point], m)
+    covariance = None
+    if first.covariance_mm2 is not None and second.covariance_mm2 is not None:
+        ends = first.covariance_mm2[a.point], second.covariance_mm2[b.point]
+        share = np.linspace(0, 1, m)[:, None, None, None]
+        covariance = (1 - share) * ends[0] + share * ends[1]
+        covariance[:, 0] += own[:, None, None] ** 2 * np.eye(3)
+    return Branch(
+        points_mm=line, radius_mm=radius_mm, sigma_mm=np.hypot(sigma, own),
+        confidence=np.full(m, 0.1), start=a.node, end=b.node,
+        covariance_mm2=covariance,
+    )  # fmt: skip
