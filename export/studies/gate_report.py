@@ -105,7 +105,7 @@ def doubt_table(rows: Sequence[Row], gates: QualityOptions) -> str:
             if gates.good_disagreement_raw < r.whole.disagreement <= gates.max_disagreement_raw
         ]  # fmt: skip
         short = [
-            r for r in doubted if min([c or 0.0 for c in r.whole.coverage] or [0.0])
+            r for r in doubted if min([c or 0.0 for c in r.whole.coverage_even] or [0.0])
             < gates.good_coverage
         ]  # fmt: skip
         oks = [sum(replayed(r, g) == OK for r in part) for g in (gates, unasked)]

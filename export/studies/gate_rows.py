@@ -57,7 +57,7 @@ class Attempt:
     ----------
     disagreement : along the epipolar lines, after the estimated correction
     shift_mm, turn_deg : that correction
-    coverage, support : per view, None where undefined
+    coverage, support, coverage_even : per view, None where undefined
     findings : reasons for ``degraded`` that have other gates
     refused : reason for a refusal that has another gate, else empty
     dsc : volume DSC at 0.5 with the tree of view 1, None where undefined
@@ -78,6 +78,7 @@ class Attempt:
     figures: tuple[tuple[float, ...], ...] = ()
     length_mm: tuple[float, ...] = ()
     off: tuple[float, ...] = ()
+    coverage_even: tuple[float | None, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -233,6 +234,7 @@ def _attempt(pair: Pair, subject: Subject, engine: Engine) -> Attempt:
         shift_mm=pose.shift_mm,
         turn_deg=pose.turn_deg,
         coverage=tuple(view.coverage for view in views),
+        coverage_even=tuple(view.coverage_even for view in views),
         support=tuple(view.support for view in views),
         findings=result.quality.findings,
         dsc=dsc,

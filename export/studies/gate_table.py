@@ -76,9 +76,9 @@ def replayed(row: Row, gates: QualityOptions) -> str:
         attempt = row.parts
     views = [
         ViewQuality(view_id=str(k + 1), name="", coverage=coverage, support=support,
-                    distance_mm=None, overlap=None)
-        for k, (coverage, support) in enumerate(
-            zip(attempt.coverage, attempt.support, strict=True)
+                    distance_mm=None, overlap=None, coverage_even=even)
+        for k, (coverage, support, even) in enumerate(
+            zip(attempt.coverage, attempt.support, attempt.coverage_even, strict=True)
         )
     ]  # fmt: skip
     if attempt.refused:

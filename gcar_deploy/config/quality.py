@@ -60,8 +60,9 @@ class QualityOptions:
     #: taken where they then disagree so many times less
     alone_disagreement_raw: Share = 0.1
     alone_ratio: Annotated[float, Range(1, 1000)] = 1.2
-    #: share of a view's skeleton that the reprojected tree explains: less than nine tenths is
-    #: worth a word whatever the costs say
+    #: share of what a view shows of vessel that the reprojected tree explains, by path length: less
+    #: than nine tenths is worth a word whatever the costs say. By pixels, thin ends that lie below
+    #: a lattice cell took ``ok`` from right trees
     good_coverage: Share = 0.9
     min_coverage: Share = 0.3
     #: share of the reprojected tree that lies on the view's vessels: 0.94 and more in pairs of

@@ -67,6 +67,7 @@ def real_files():
 def row(kind="same", pictures="raw", disagreement=0.1, coverage=0.95, dsc=0.8, other=1.0, **more):
     whole = Attempt(
         disagreement=disagreement, shift_mm=0.0, turn_deg=0.0, coverage=(coverage, 0.99),
+        coverage_even=(coverage, 0.99),
         support=(1.0, 1.0), dsc=dsc, shape_mm=0.5, **more,
     )  # fmt: skip
     return Row(

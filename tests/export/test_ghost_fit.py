@@ -18,7 +18,8 @@ GATES = QualityOptions()
 
 def row(figures, off, dsc=0.8, kind="same", pictures="path length", number=0):
     whole = Attempt(
-        disagreement=0.001, shift_mm=0.0, turn_deg=0.0, coverage=(0.99, 0.99), support=(1.0, 1.0),
+        disagreement=0.001, shift_mm=0.0, turn_deg=0.0, coverage=(0.99, 0.99),
+        coverage_even=(0.99, 0.99), support=(1.0, 1.0),
         dsc=dsc, figures=tuple(map(tuple, figures)), length_mm=(8.0,) * len(figures),
         off=tuple(off),
     )  # fmt: skip

@@ -13,6 +13,7 @@ from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.quality.status import assess, part_lengths_mm, view_quality
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree, empty_tree
+from tests.hard.phantoms import both, paths, straight
 
 OPTIONS = QualityOptions()
 
@@ -80,6 +81,19 @@ def test_match_rate_and_strict_coverage(case):
     assert quality.match_rate > 0.97 and 0.0 < quality.foreshortening < 0.5
     assert quality.coverage_2px <= quality.coverage
     assert view_quality(tree, views[0], views[0].mask, OPTIONS).match_rate is None
+
+
+@pytest.mark.parametrize("found", [0, 1])
+def test_a_thin_vessel_that_is_missed_counts_less_than_a_thick_one(found):
+    """Two bars of one length, 2.0 and 1.0 mm: path lengths through the middle are as the radii."""
+    thick = straight((1, 0, 0), radius=2.0, middle=(0, 0, 12))
+    bars = both(thick, straight((1, 0, 0), radius=1.0, middle=(0, 0, -12)))
+    view = extract_vessels(paths(bars)[0], ImagingOptions())
+    part = dataclasses.replace(bars, branches=bars.branches[found : found + 1])
+    share = view_quality(part, view, view.mask, OPTIONS).coverage
+    assert share == pytest.approx((2 / 3, 1 / 3)[found], abs=0.04)
+    pale = dataclasses.replace(view, path_mm=0 * view.path_mm)  # nothing to weigh by
+    assert view_quality(part, pale, view.mask, OPTIONS).coverage == pytest.approx(0.5, abs=0.03)
 
 
 def test_ok_says_what_was_checked_what_was_not_and_how_many_pieces(case):
