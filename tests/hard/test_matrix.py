@@ -21,31 +21,19 @@ from tests.hard.phantoms import (
 )
 
 ARGUMENTS = ("make", "allowed", "truth", "grid")
-#: cases that end ``ok`` and are wrong: faults of the program, not of the test
-KNOWN_FAULTS = {
-    "5 ghosts: 2 bars 9 mm apart": "a ghost beside the two bars is taken for a third vessel",
-    "7 hardly any vessel: beyond the picture": "ends cut off by the borders mislead the pose",
-    "11 polarities: raw bright": "raw paths: farther off than stated by a seventh",
-    "11 polarities: raw dark": "raw paths: farther off than stated by a seventh",
-    "13 noise: 10000 photons": "raw paths: farther off than stated by a tenth",
-    "13 noise: 100 photons": "two branches of a noisy raw pair are exchanged unnoticed",
-}
 
 
-def cases(with_faults):
-    """One parameter set per case; with the shipped predictor, known faults may fail."""
+def cases():
+    """One parameter set per case."""
     out = []
     for family, make in FAMILIES.items():
         for name, *case in make():
-            key = f"{family}: {name}"
-            known = with_faults and key in KNOWN_FAULTS
-            marks = [pytest.mark.xfail(reason=KNOWN_FAULTS[key])] if known else []
             values = case if len(case) == len(ARGUMENTS) else (*case, GRID)
-            out.append(pytest.param(*values, id=key, marks=marks))
+            out.append(pytest.param(*values, id=f"{family}: {name}"))
     return out
 
 
-CASES = cases(with_faults=True)
+CASES = cases()
 #: the quick part takes one of each family: the first that has a truth, or the first
 QUICK = [
     min(
@@ -75,7 +63,6 @@ def test_six_variants_of_every_family_and_each_has_a_class_or_a_truth():
         for name, _, allowed, truth, *_ in made:
             assert ("ok" in allowed) == (truth is not None) or allowed <= NOT_OK, name
             assert allowed == DONE or allowed <= NOT_OK or allowed == {"error 4"}, name
-    assert {str(case.id) for case in CASES} >= set(KNOWN_FAULTS)
     assert len(QUICK) == len(FAMILIES) == 19
 
 
@@ -110,7 +97,7 @@ def test_swapped_pictures_are_asked_for_by_name(bare):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(ARGUMENTS, cases(with_faults=False))
+@pytest.mark.parametrize(ARGUMENTS, CASES)
 def test_without_a_model_nothing_is_ok(bare, make, allowed, truth, grid):
     """Depth from thinning alone is told as such: done means degraded."""
     check(outcome(make, bare, grid), {"degraded"} if allowed == DONE else allowed, truth)
