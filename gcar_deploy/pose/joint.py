@@ -9,8 +9,10 @@ only directions that no pair sees are left to the prior.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +36,8 @@ from gcar_deploy.types import Array, Scalars
 #: offsets are sought together
 LEAST_APART_DEG = 10.0
 STARTS = 60
+#: differences of profiles that are kept, some 10 kB each
+MOST_KNOWN = 256
 #: more views than this are corrected pair by pair alone
 MOST_VIEWS = 4
 #: pairs that disagree by no more than this as they are told, are left alone (four views of one
@@ -89,7 +93,7 @@ class _Problem:
     options: PoseOptions
     marks: Array
 
-    @property
+    @functools.cached_property
     def pairs(self) -> list[tuple[int, int]]:
         """Pairs with vessels whose planes cut slices: neither nearly parallel nor opposite."""
         out = []
@@ -107,24 +111,48 @@ class _Problem:
     def prior(self) -> Array:
         return prior_sigmas()
 
+    @functools.cached_property
+    def roots(self) -> dict[int, Array]:
+        """Square root of the prior of each view's correction."""
+        return {k: prior_root(mass.carm) for k, mass in self.seen.items()}
+
+    @functools.cached_property
+    def _known(self) -> dict[tuple[float | bytes, ...], Any]:
+        """Views and differences of late: a step of one view leaves the pairs of others as is."""
+        return {}
+
+    def placed(self, k: int, theta: Array) -> Mass:
+        """Return a view with its correction built in."""
+        key = (k, theta[k].tobytes())
+        if key not in self._known:
+            mass = self.seen[k]
+            self._keep(key, dataclasses.replace(mass, carm=corrected(mass.carm, theta[k])))
+        mass = self._known[key]
+        return mass
+
     def pair(self, i: int, j: int, theta: Array) -> tuple[Mass, Mass, CArm]:
         """Both views with the correction of the first built in, and the second's C-arm."""
-        a, b = self.seen[i], self.seen[j]
-        fixed = dataclasses.replace(a, carm=corrected(a.carm, theta[i]))
-        return fixed, b, corrected(b.carm, theta[j])
+        return self.placed(i, theta), self.seen[j], self.placed(j, theta).carm
 
     def differences(self, i: int, j: int, theta: Array, sigma_mm: float) -> Scalars:
         """Profile of one view minus that of the other, as shares of its norm."""
-        fixed, moving, carm = self.pair(i, j, theta)
-        a, b = mass_profiles(fixed, moving, carm, sigma_mm)
-        out: Scalars = (a - b) / np.sqrt(float(a @ a))
+        key = (i, j, sigma_mm, theta[i].tobytes(), theta[j].tobytes())
+        if key not in self._known:
+            a, b = mass_profiles(*self.pair(i, j, theta), sigma_mm)
+            self._keep(key, (a - b) / np.sqrt(float(a @ a)))
+        out: Scalars = self._known[key]
         return out
+
+    def _keep(self, key: tuple[float | bytes, ...], value: Any) -> None:
+        if len(self._known) >= MOST_KNOWN:
+            self._known.clear()
+        self._known[key] = value
 
     def residuals(self, x: Array, sigma_mm: float, noise: float) -> Scalars:
         """All differences, landmark gaps and corrections over their standard deviations."""
         theta = _with_first(x)
         parts = [
-            prior_root(self.seen[k].carm) @ t if k in self.seen else t / self.prior
+            self.roots[k] @ t if k in self.seen else t / self.prior
             for k, t in enumerate(theta[1:], start=1)
         ]
         for i, j in self.pairs:
@@ -164,7 +192,7 @@ class _Problem:
         from scipy.optimize import minimize
 
         steps = np.arange(-2 * SEARCH_MM, 2 * SEARCH_MM + 1e-9, STEP_MM)
-        zero, curves = np.zeros_like(first), []
+        zero, curves, normals = np.zeros_like(first), [], []
         for i, j in self.pairs:
             fixed, moving, _ = self.pair(i, j, zero)
             normal = plane_normal(fixed.carm, moving.carm)
@@ -174,18 +202,23 @@ class _Problem:
                 at[j, :3] = step * normal
                 apart = self.differences(i, j, at, self.options.coarse_mm) / self.noise
                 misfit.append(float(np.sum(apart**2)))
-            curves.append((i, j, normal, CubicSpline(steps, misfit, bc_type="clamped")))
+            curves.append(CubicSpline(steps, misfit, bc_type="clamped").c)
+            normals.append(normal)
+        # (4, intervals, pairs) coefficients of all curves, and which views each pair holds.
+        cubic, which = np.stack(curves, axis=2), np.arange(len(curves))
+        normal_of, (first_of, second_of) = np.stack(normals), np.array(self.pairs).T
+        sign = np.zeros((len(first), len(which)))
+        sign[second_of, which], sign[first_of, which] = 1.0, -1.0
 
         def cost(x: Array) -> tuple[float, Array]:
             d = np.vstack([np.zeros(3), x.reshape(-1, 3)])
-            value = float(np.sum((d / OFFSET_MM) ** 2))
-            slope = 2.0 * d / OFFSET_MM**2
-            for i, j, normal, curve in curves:
-                along = float(np.clip(normal @ (d[j] - d[i]), steps[0], steps[-1]))
-                value += float(curve(along))
-                pull = float(curve(along, 1)) * normal
-                slope[j] += pull
-                slope[i] -= pull
+            along = np.einsum("ij,ij->i", normal_of, d[second_of] - d[first_of])
+            along = np.minimum(np.maximum(along, steps[0]), steps[-1])
+            piece = np.minimum(((along - steps[0]) / STEP_MM).astype(np.int64), len(steps) - 2)
+            h, (a, b, c, e) = along - steps[piece], cubic[:, piece, which]
+            value = float(np.sum((d / OFFSET_MM) ** 2) + np.sum(((a * h + b) * h + c) * h + e))
+            pull = (3.0 * a * h + 2.0 * b) * h + c
+            slope = 2.0 * d / OFFSET_MM**2 + sign @ (pull[:, None] * normal_of)
             return value, slope[1:].ravel()
 
         rng = np.random.default_rng(0)

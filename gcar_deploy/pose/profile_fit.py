@@ -73,16 +73,24 @@ def fit_profiles(
     converged : bool, False where the fit that gave ``x`` was stopped by ``MAX_EVALUATIONS``
     """
     steps = STEP_SHARE * np.diag(prior)
+    last: tuple[object, Scalars] = None, np.empty(0)
+
+    def told(x: Array, sigma: float, noise: float) -> Scalars:
+        nonlocal last
+        last = (x.tobytes(), sigma, noise), residuals(x, sigma, noise)
+        return last[1]
 
     def slopes(x: Array, sigma: float, noise: float) -> Array:
-        # Steps of the priors' size: a share of the value itself means nothing near zero.
-        here = residuals(x, sigma, noise)
+        # Steps of the priors' size: a share of the value itself means nothing near zero. The
+        # solver asks for slopes where it has just asked for residuals.
+        asked = x.tobytes(), sigma, noise
+        here = last[1] if last[0] == asked else residuals(x, sigma, noise)
         ahead = [residuals(x + step, sigma, noise) - here for step in steps]
         return np.stack(ahead, axis=1) / np.diag(steps)
 
     def fitted(x: Array, sigma: float, noise: float) -> tuple[Array, bool]:
         solution = least_squares(
-            residuals, x, jac=slopes, args=(sigma, noise), x_scale=prior,
+            told, x, jac=slopes, args=(sigma, noise), x_scale=prior,
             ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
         return np.round(solution.x, DIGITS), bool(solution.status > 0)
