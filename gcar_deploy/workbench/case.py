@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gcar_deploy.config import PictureLimits, RunOptions
 from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import is_dicom, read_header
@@ -26,6 +28,7 @@ from gcar_deploy.inputs.order import Order, order_to_json, parse_order
 from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.result import Result
 from gcar_deploy.steps import Step
+from gcar_deploy.types import Array
 
 ORDER_NAME = "order.json"
 RESULT_NAME = "result"
@@ -52,6 +55,8 @@ class Case:
     result : of the last run that ended well, None before
     job_id : of the last run, None before
     vessels : found by the last run, refused or not, in the order of the views; empty before
+    pair_scores : numbers of two views, from 1, the lower first -> (n, m) how well each frame of
+        the one goes with each of the other, 0 .. 1; empty where nobody judged pairs
     """
 
     def __init__(self, folder: Path, order: Order) -> None:
@@ -60,6 +65,7 @@ class Case:
         self.result: Result | None = None
         self.job_id: str | None = None
         self.vessels: tuple[VesselImage, ...] = ()
+        self.pair_scores: dict[tuple[int, int], Array] = {}
         self._frame: OwnFrame | None = None
         self._read: tuple[str, tuple[tuple[Angiogram, ...], list[str]]] | None = None
         self._lock = threading.Lock()
@@ -135,6 +141,15 @@ class Case:
             }
             for a in angiograms
         ]  # fmt: skip
+        return out
+
+    def scores_with(self, number: int) -> dict[str, list[list[float]]]:
+        """Return number of another view -> scores of each frame of view ``number`` with its own."""
+        out = {}
+        for (a, b), scores in self.pair_scores.items():
+            if number in (a, b):
+                own = scores if number == a else scores.T
+                out[str(b if number == a else a)] = np.round(own, 3).tolist()
         return out
 
     def run_of(self, number: int) -> Frames:

@@ -25,6 +25,7 @@ from gcar_deploy.workbench.case import RESULT_NAME, Case
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.workbench.shown import (
     epipolar,
+    flat_png,
     found_png,
     picture_png,
     result_data,
@@ -157,6 +158,11 @@ def _pictures(app: Flask, desk: Desk) -> None:
         angiograms = _case(desk, case_id).angiograms()
         return _png(picture_png(angiograms[_place(view, len(angiograms))].pixels))
 
+    @app.get("/api/cases/<case_id>/views/<int:view>/flat.png")
+    def flat(case_id: str, view: int) -> Any:
+        angiograms = _case(desk, case_id).angiograms()
+        return _png(flat_png(angiograms[_place(view, len(angiograms))]))
+
     @app.get("/api/cases/<case_id>/views/<int:view>/found.png")
     def found(case_id: str, view: int) -> Any:
         vessels = _case(desk, case_id).vessels
@@ -169,12 +175,13 @@ def _pictures(app: Flask, desk: Desk) -> None:
         run = _case(desk, case_id).run_of(view)
         if len(run) == 1:
             return {"frames": 1, "chosen": 1, "reason": "the only one", "filling": [1.0],
-                    "motion": [0.0]}  # fmt: skip
+                    "motion": [0.0], "pairs": {}}  # fmt: skip
         filling, motion = filling_and_motion(run)
         choice = choose_frame(run, None)
         return {
             "frames": len(run), "chosen": choice.index + 1, "reason": choice.reason,
             "filling": filling.tolist(), "motion": (motion / max(motion.max(), 1e-9)).tolist(),
+            "pairs": _case(desk, case_id).scores_with(view),
         }  # fmt: skip
 
     @app.get("/api/cases/<case_id>/views/<int:view>/frames/<int:frame>.png")

@@ -10,12 +10,15 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import epipolar_lines
-from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import is_dark
 from gcar_deploy.output.overlay import grey8, png_bytes
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.result import Result
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Image, Mask, Pixels
+from gcar_deploy.workbench.alternatives import alternatives
+from gcar_deploy.workbench.trace import bright_picture
 
 #: blue, green, red, opacity: vessel, its line, catheter. Apart for all kinds of colour vision
 _VESSEL, _LINE, _CATHETER = (233, 180, 86, 110), (255, 255, 255, 220), (0, 159, 230, 170)
@@ -24,7 +27,7 @@ _CROSSED_PX = 0.75
 
 
 def result_data(result: Result) -> dict[str, Any]:
-    """Return tree, lesions, ways from ostium to tip, and the summary."""
+    """Return tree, lesions, ways from ostium to tip, what else there may be, and the summary."""
     summary = result.summary()
     start = inlet_arcs(result.tree)
     scene = scene_data(result)
@@ -32,7 +35,10 @@ def result_data(result: Result) -> dict[str, Any]:
         branch["from_ostium"] = round(start[branch["branch"] - 1], 2)
         branch["middle"] = middle(result.tree, branch["branch"] - 1)
         branch["row"] = row
-    return {"summary": summary, "scene": scene, "ways": ways(result.tree)}
+    return {
+        "summary": summary, "scene": scene, "ways": ways(result.tree),
+        "alternatives": alternatives(result),
+    }  # fmt: skip
 
 
 def middle(tree: Tree, branch: int) -> list[float]:
@@ -74,6 +80,12 @@ def ways(tree: Tree) -> list[list[int]]:
 def picture_png(pixels: Image) -> bytes:
     """Return a picture as grey PNG."""
     return png_bytes(grey8(pixels))
+
+
+def flat_png(angiogram: Angiogram) -> bytes:
+    """Return a picture without its background, grey PNG; vessels dark where they were."""
+    flat = bright_picture(angiogram)
+    return png_bytes(grey8(-flat if is_dark(angiogram) else flat))
 
 
 def thumbnail_png(pixels: Image, side: int) -> bytes:

@@ -51,7 +51,7 @@ def trace(
     low = np.maximum(np.minimum(first, last) - room, 0)
     high = np.minimum(np.maximum(first, last) + room + 1, shape)
     part = (slice(low[0], high[0]), slice(low[1], high[1]))
-    lines, scale = _ridges(_bright(angiogram)[part])
+    lines, scale = _ridges(bright_picture(angiogram)[part])
     if found is not None:
         lines[found.mask[part]] = np.maximum(lines[found.mask[part]], 0.5)
     way, _ = route_through_array(
@@ -64,7 +64,8 @@ def trace(
     return {"points": points.tolist(), "width_px": round(max(width, 3.0), 1)}
 
 
-def _bright(angiogram: Angiogram) -> Image:
+def bright_picture(angiogram: Angiogram) -> Image:
+    """(rows, cols) the picture with its vessels bright, without what lies behind them."""
     kind = angiogram.intensity.kind
     if kind in ("path_length", "mask"):
         return angiogram.pixels

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from gcar_deploy.engine import deliver
-from gcar_deploy.inputs.order import Order, load_order
-from tests.conftest import data_dir
-from tests.workbench.conftest import finished
+from gcar_deploy.inputs.order import Order, load_order, parse_order
+from tests.workbench.conftest import finished, of_data, ready_case
 
 AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 #: what a run writes that holds no clock
@@ -95,27 +94,19 @@ def test_demo_to_result_to_deletion_and_back(serve, browse, engine, tmp_path):
     assert repeated(engine, case, tmp_path / "again") == without
 
 
-def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
-    """Erase, landmark pair on its epipolar line, run, delete a branch, undo; the order repeats."""
-    folder = data_dir() / "cases" / "R_0001"
-    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
-    address, cases = serve(lambda desk: desk.add(desk.new_folder("raw"), given).id)
-    page = browse(address, 1500)
-    case = cases / "raw"
-    finished(page)
-    assert page.locator("#lesions tbody tr").count() > 2
+def way_of_a_case(page, case, strokes, marks):
+    """Erase in view 1, mark a landmark pair, run, delete a branch, undo all; each run's files.
+
+    Returns
+    -------
+    files of the result with the corrections, and with a branch less
+    """
     page.keyboard.press("e")
-    stroke(page, 1, [(20, 480), (60, 490), (90, 500)])
+    stroke(page, 1, strokes)
     until_order(page, case, lambda o: len(o.get("edits", {}).get("1", ())) == 1)
     drawn = order_of(case)["edits"]["1"][0]
     assert drawn["do"] == "erase" and drawn["width_px"] == 14
-    assert np.allclose(drawn["points"][0], (20, 480), atol=1.5)
-
-    from gcar_deploy.geometry.scene import load_scene
-
-    carms = [view.carm for view in load_scene(folder / "geom.json").views]
-    place = np.array([[4.0, -12.0, 8.0]])
-    marks = [carm.project(place)[0][0] for carm in carms]
+    assert np.allclose(drawn["points"][0], strokes[0], atol=1.5)
     page.keyboard.press("l")
     click(page, 1, marks[0])
     page.wait_for_timeout(600)
@@ -124,7 +115,7 @@ def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
     pair = order_of(case)["landmarks"][0]
     assert np.allclose(pair[0], marks[0], atol=1.5)
     # Snapped to a vessel on the line, or where the click was.
-    assert np.linalg.norm(np.array(pair[1]) - marks[1]) < 12
+    assert np.linalg.norm(np.array(pair[1]) - marks[1]) < 24
     page.click("#run")
     finished(page)
     page.click("#status summary >> nth=0")
@@ -135,15 +126,74 @@ def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
     until(page, lambda: rows.count() < before)
     finished(page)
     shorter = files_of(case / "result")
-    assert repeated(engine, case, tmp_path / "again") == shorter != corrected
+    order = (case / "order.json").read_bytes()
     page.click("#undo")
     until(page, lambda: rows.count() == before)
     finished(page)
-    assert files_of(case / "result") == corrected
+    assert files_of(case / "result") == corrected != shorter
     page.keyboard.press("Control+z")
     until_order(page, case, lambda o: "landmarks" not in o)
     page.keyboard.press("Control+z")
     until_order(page, case, lambda o: "edits" not in o)
+    return shorter, order
+
+
+def repeated_from(engine, case, order: bytes, out: Path) -> dict[str, bytes]:
+    """What an order that the case had earlier gives."""
+    (case / "order.json").write_bytes(order)
+    return repeated(engine, case, out)
+
+
+def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
+    """Erase, landmark pair on its epipolar line, run, delete a branch, undo; the order repeats."""
+    from gcar_deploy.geometry.scene import load_scene
+
+    folder = ready_case("R_0001")
+    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
+    address, cases = serve(lambda desk: desk.add(desk.new_folder("raw"), given).id)
+    page = browse(address, 1500)
+    finished(page)
+    assert page.locator("#lesions tbody tr").count() > 2
+    carms = [view.carm for view in load_scene(folder / "geom.json").views]
+    marks = [carm.project(np.array([[4.0, -12.0, 8.0]]))[0][0] for carm in carms]
+    shorter, order = way_of_a_case(page, cases / "raw", [(20, 480), (60, 490), (90, 500)], marks)
+    assert repeated_from(engine, cases / "raw", order, tmp_path / "again") == shorter
+
+
+@pytest.mark.slow
+def test_phantom_runs_dropped_on_the_page_go_the_whole_way(serve, browse, engine, tmp_path):
+    """Real DICOM runs: dropped, frames chosen, corrected, repeated from their order."""
+    pytest.importorskip("gdcm", reason="the runs are JPEG lossless")
+    folder = of_data("phantom_xa")
+    told = json.loads((Path(__file__).parents[1] / "data" / "phantom_landmarks.json").read_text())
+    address, cases = serve()
+    page = browse(address, 1500)
+    page.set_input_files("#files", [folder / "IM7.dcm", folder / "IM8.dcm"])
+    assert finished(page) in ("ok", "degraded")
+    strips = page.locator("#frames .strip")
+    until(page, lambda: strips.count() == 2 and strips.first.locator("button").count() == 9)
+    marks = [np.array(point) for point in told["IM7-IM8"][0]]
+    shorter, order = way_of_a_case(page, cases / "case", [(30, 470), (60, 480), (90, 490)], marks)
+    assert repeated_from(engine, cases / "case", order, tmp_path / "again") == shorter
+
+
+@pytest.mark.slow
+def test_five_corrections_mend_a_raw_case(serve, engine):
+    """Three vessels that view 1 shows faintly, painted: DSC from below to above 0.85."""
+    import nibabel
+
+    folder = ready_case("R_0401")
+    truth = np.asarray(nibabel.load(folder / "truth.nii.gz").dataobj) >= 0.5
+    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
+    seen_faintly = [[[296, 137], [309, 146], [323, 155]], [[164, 179], [147, 192]],
+                    [[99, 252], [121, 233]]]  # fmt: skip
+    strokes = [{"do": "paint", "width_px": 9, "points": points} for points in seen_faintly]
+    corrected = parse_order({**given.to_dict(), "edits": {"1": strokes}})
+    found = []
+    for order in (given, corrected):
+        made = engine.reconstruct_order(order).volume >= 0.5
+        found.append(2 * (made & truth).sum() / (made.sum() + truth.sum()))
+    assert found[0] < 0.85 < found[1], found
 
 
 def test_tools_write_what_they_say(serve, browse):
@@ -203,12 +253,26 @@ def test_one_printed_page(serve, browse):
     assert document.count(b"/Type /Page\n") + document.count(b"/Type /Page ") == 1
 
 
+def test_demo_to_a_result_in_three_clicks(serve, browse, record_property):
+    """From opening the address: clicks counted; the wall limit is that of a busy machine."""
+    address, _ = serve()
+    started = time.perf_counter()
+    page = browse(address)
+    page.evaluate("window.clicks = 0; addEventListener('click', () => window.clicks++, true)")
+    page.click("#demo")
+    page.wait_for_selector("#lesions tbody tr")
+    seconds = time.perf_counter() - started
+    record_property("seconds", seconds)
+    assert page.evaluate("window.clicks") <= 3 and seconds < 240
+
+
 @pytest.mark.benchmark
 def test_demo_takes_less_than_ten_seconds(serve, browse):
     address, _ = serve()
-    page = browse(address)
-    page.wait_for_selector("#demo:visible")
     started = time.perf_counter()
+    page = browse(address)
     page.click("#demo")
     page.wait_for_selector("#lesions tbody tr")
-    assert time.perf_counter() - started < 10
+    seconds = time.perf_counter() - started
+    print(f"from opening the demo to its result: {seconds:.1f} s, one click")
+    assert seconds < 10

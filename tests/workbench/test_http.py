@@ -11,7 +11,7 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.worker.jobs import JobQueue
 from tests.cli.conftest import good_case  # noqa: F401 - a fixture
-from tests.workbench.conftest import TOKEN
+from tests.workbench.conftest import TOKEN, ready_case
 
 pytest.importorskip("flask")
 pytest.importorskip("waitress")
@@ -159,3 +159,36 @@ def test_a_trace_follows_the_line_not_the_chord():
     points = np.array(found["points"])
     assert abs(np.hypot(points[:, 0] - 60, points[:, 1] - 80) - 40).max() < 3
     assert 4 < found["width_px"] < 14
+
+
+def test_a_picture_without_its_background_keeps_its_vessels(ask, desk):
+    import cv2
+    import numpy as np
+
+    from gcar_deploy.inputs.order import Order
+
+    folder = ready_case("R_0001")
+    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
+    case = desk.add(desk.new_folder("raw"), given)
+    raw, flat = (
+        cv2.imdecode(np.frombuffer(ask("GET", f"/api/cases/{case.id}/views/1/{n}.png").data,
+                                   np.uint8), cv2.IMREAD_GRAYSCALE)
+        for n in ("picture", "flat")
+    )  # fmt: skip
+    assert raw.shape == flat.shape
+    vessel = cv2.imread(str(ready_case("C_0001") / "view1.png"), -1) > 1000
+    away = cv2.dilate(vessel.astype(np.uint8), np.ones((25, 25))) == 0
+    # Vessels stay dark, and what lies elsewhere varies less than before against them.
+    contrast = [float(np.median(p[away]) - np.median(p[vessel])) for p in (raw, flat)]
+    spread = [float(np.std(cv2.GaussianBlur(p, (0, 0), 4)[away])) for p in (raw, flat)]
+    assert contrast[1] > 0 and contrast[1] / spread[1] > contrast[0] / spread[0]
+
+
+def test_scores_of_frame_pairs_are_told_from_either_view(ask, desk):
+    import numpy as np
+
+    case = desk.demo()
+    assert case.scores_with(1) == {}
+    case.pair_scores[1, 2] = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    assert case.scores_with(1) == {"2": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]}
+    assert case.scores_with(2) == {"1": [[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]}

@@ -27,6 +27,14 @@ export function pen(canvas) {
   return [ctx, width, height];
 }
 
+/** Keep what a canvas shows as a picture. */
+export function saved(canvas, name) {
+  canvas.toBlob(blob => {
+    const link = el("a", { href: URL.createObjectURL(blob), download: name });
+    link.click(); URL.revokeObjectURL(link.href);
+  });
+}
+
 export function inside(event, target) {
   const box = target.getBoundingClientRect();
   return [event.clientX - box.left, event.clientY - box.top];

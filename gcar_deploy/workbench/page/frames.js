@@ -14,11 +14,25 @@ export async function frames(store, say) {
   } catch (error) { say(error.message); }
 }
 
+function bar(kind, share) {
+  const meter = el("span", { class: kind }, el("span", {}));
+  meter.firstChild.style.width = `${Math.round(100 * share)}%`;
+  return meter;
+}
+/** Scores of this run's frames with the frame that another view shows now; null where nobody judged pairs. */
+function partner(store, pairs) {
+  const [view, scores] = Object.entries(pairs)[0] ?? [];
+  const frames = store.info.order.frames;
+  const now = view && frames && (frames.length === 1 ? frames[0] : frames[view - 1]);
+  return now ? scores.map(row => row[now - 1]) : null;
+}
+
 async function strip(store, say, k) {
   const path = `${store.path}/views/${k + 1}/frames`, told = await api.get(path);
   const order = store.info.order.frames;
   const asked = order && (order.length === 1 ? order[0] : order[k]);
   const now = asked ?? told.chosen;
+  const with_ = partner(store, told.pairs);
   const near = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(async one => {
     near.unobserve(one.target);
     one.target.src = await api.imageUrl(`${path}/${one.target.dataset.frame}.png`);
@@ -26,13 +40,12 @@ async function strip(store, say, k) {
   const buttons = told.filling.map((filling, i) => {
     const picture = el("img", { alt: "", "data-frame": i + 1 });
     near.observe(picture);
-    const meter = el("span", { class: "meter" }, el("span", {}));
-    meter.firstChild.style.width = `${Math.round(100 * filling)}%`;
+    const meter = bar("meter", filling), pair = with_ && bar("meter pair", with_[i]);
     return el("button", { type: "button", "aria-pressed": String(i + 1 === now),
-      title: `Contrast ${Math.round(100 * filling)} %, motion ${Math.round(100 * told.motion[i])} % of the most`,
-      onclick: () => choose(store, say, k, i + 1) }, picture, meter, `${i + 1}${i + 1 === told.chosen ? " \u2605" : ""}`);
+      title: `Contrast ${Math.round(100 * filling)} %, motion ${Math.round(100 * told.motion[i])} % of the most${with_ ? `, with the other view's frame ${Math.round(100 * with_[i])} %` : ""}`,
+      onclick: () => choose(store, say, k, i + 1) }, picture, meter, pair, `${i + 1}${i + 1 === told.chosen ? " \u2605" : ""}`);
   });
-  return el("div", {}, el("p", { class: "hint" }, `View ${k + 1}: frame ${now} of ${told.frames}${asked ? " (yours)" : ` (${told.reason})`}. Bar: contrast. \u2605: proposed.`),
+  return el("div", {}, el("p", { class: "hint" }, `View ${k + 1}: frame ${now} of ${told.frames}${asked ? " (yours)" : ` (${told.reason})`}. Bar: contrast${with_ ? "; below: with the other view's frame" : ""}. \u2605: proposed.`),
     el("div", { class: "strip", tabindex: 0, role: "group", "aria-label": `Frames of view ${k + 1}` }, ...buttons));
 }
 

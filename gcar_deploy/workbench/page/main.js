@@ -5,13 +5,13 @@ import { frames } from "./frames.js";
 import { geometry } from "./geometry.js";
 import { Curve, table } from "./lumen.js";
 import { Picture } from "./picture.js";
-import { corrections, files, status } from "./report.js";
+import { alternatives, corrections, files, status } from "./report.js";
 import { Scene3D } from "./scene3d.js";
 import { Store } from "./store.js";
 import { Toolbox, TOOLS } from "./tools.js";
 
 const store = new Store();
-const look = { found: true, tree: true, lens: false, width: 2 };
+const look = { flat: false, found: true, tree: true, lens: false, width: 2 };
 const tools = new Toolbox(store, say);
 const curve = new Curve(store);
 let pictures = [], scene = new Scene3D(store);
@@ -61,6 +61,13 @@ async function load() {
     picture.draw();
   }));
 }
+/** Pictures without their background are made when they are first asked for. */
+async function loadFlat() {
+  await Promise.all(pictures.map(async picture => {
+    picture.flat ??= await api.image(`${store.path}/views/${picture.number}/flat.png`);
+    picture.draw();
+  }));
+}
 async function loadFound() {
   await Promise.all(pictures.map(async picture => {
     picture.found = await api.image(`${store.path}/views/${picture.number}/found.png`);
@@ -73,6 +80,7 @@ function lay() {
   $("pictures").replaceChildren(...pictures.map(p => p.root), scene.root);
   $("tools").hidden = !pictures.length;
   attempt(load);
+  if (look.flat) attempt(loadFlat);
   geometry(store, say); frames(store, say);
 }
 function draw() { pictures.forEach(p => p.draw()); scene.draw(); curve.draw(); }
@@ -84,13 +92,18 @@ function buttons() {
   $("run").classList.toggle("stale", store.stale && !store.running);
   $("run").hidden = store.running; $("cancel").hidden = !store.running;
 }
+/** Pick a stated alternative: what it adds to the corrections, and a new run. */
+const pick = one => attempt(async () => {
+  await store.change(Object.fromEntries(Object.entries(one.add).map(([key, more]) => [key, [...store.now[key] ?? [], ...more]])));
+  await store.run();
+});
 /** Delete a branch: its middle names it in the order, whatever its number will be. */
 const erase = branch => attempt(async () => {
   await store.change({ deleted_mm: [...store.now.deleted_mm ?? [], branch.middle] });
   await store.run();
 });
 
-store.addEventListener("opened", () => { lay(); buttons(); status(store); corrections(store, say); $("lumen").hidden = true; $("files-of").hidden = true; });
+store.addEventListener("opened", () => { lay(); buttons(); status(store); corrections(store, say); $("lumen").hidden = true; $("files-of").hidden = true; $("alternatives").hidden = true; });
 store.addEventListener("pictures", lay);
 store.addEventListener("changed", () => {
   buttons(); corrections(store, say); draw();
@@ -108,7 +121,7 @@ store.addEventListener("progress", () => {
 store.addEventListener("finished", () => {
   const done = store.result !== null;
   $("lumen").hidden = !done; scene.root.hidden = !done;
-  status(store); buttons(); files(store);
+  status(store); buttons(); files(store); alternatives(store, pick);
   if (done) { table(store, erase); scene.take(); curve.take(); mark(); }
   draw(); attempt(loadFound);
 });
@@ -121,8 +134,8 @@ $("run").addEventListener("click", () => attempt(() => store.run()));
 $("cancel").addEventListener("click", () => attempt(() => store.cancel()));
 $("undo").addEventListener("click", () => attempt(() => store.undo()));
 $("redo").addEventListener("click", () => attempt(() => store.redo()));
-for (const [id, key] of [["show-found", "found"], ["show-tree", "tree"], ["show-lens", "lens"]]) {
-  $(id).addEventListener("change", () => { look[key] = $(id).checked; draw(); });
+for (const [id, key] of [["show-found", "found"], ["show-tree", "tree"], ["show-lens", "lens"], ["show-flat", "flat"]]) {
+  $(id).addEventListener("change", () => { look[key] = $(id).checked; draw(); if (look.flat) attempt(loadFlat); });
 }
 $("line-width").addEventListener("input", () => { look.width = Number($("line-width").value); draw(); });
 const drop = $("drop");

@@ -1,12 +1,12 @@
 // One angiogram: picture, vessels found, strokes, marks and the tree over it; zoom and pan.
-import { colorOf, el, gapAt, inside, nameOf, names, pen, ring } from "./dom.js";
+import { colorOf, el, gapAt, inside, nameOf, names, pen, ring, saved } from "./dom.js";
 
 const LENS = 70;
 
 export class Picture {
   /** store: Store; number: of the view, from 1; tools: Toolbox; look: what is shown. */
   constructor(store, number, tools, look) {
-    Object.assign(this, { store, number, tools, look, image: null, found: null, hover: null, cross: null });
+    Object.assign(this, { store, number, tools, look, image: null, flat: null, found: null, hover: null, cross: null });
     this.zoom = 1; this.shift = [0, 0]; this.from = null; this.moved = 0;
     const info = store.info.views[number - 1];
     this.canvas = el("canvas", { tabindex: 0, role: "img", "aria-label": `View ${info.id}, ${info.name}: the picture with the tree; arrow keys move, plus and minus zoom` });
@@ -14,7 +14,7 @@ export class Picture {
     const button = (text, name, act) => el("button", { type: "button", "aria-label": `${name} view ${info.id}`, title: name, onclick: act }, text);
     this.root = el("div", { class: "view" }, this.canvas, this.title, el("div", { class: "zoom" },
       button("+", "Zoom in", () => this.scale(1.4)), button("\u2212", "Zoom out", () => this.scale(1 / 1.4)),
-      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => this.save())));
+      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => saved(this.canvas, `view${number}.png`))));
     this.listen();
   }
 
@@ -45,12 +45,6 @@ export class Picture {
     this.draw();
   }
   reset() { this.zoom = 1; this.shift = [0, 0]; this.draw(); }
-  save() {
-    this.canvas.toBlob(blob => {
-      const link = el("a", { href: URL.createObjectURL(blob), download: `view${this.number}.png` });
-      link.click(); URL.revokeObjectURL(link.href);
-    });
-  }
 
   listen() {
     const canvas = this.canvas;
@@ -124,7 +118,7 @@ export class Picture {
     const corner = this.put([-0.5, -0.5]), k = this.unit, [columns, rows] = this.size;
     ctx.imageSmoothingEnabled = k < 3;
     const lay = picture => picture && ctx.drawImage(picture, ...corner, columns * k, rows * k);
-    lay(this.image);
+    lay(this.look.flat ? this.flat ?? this.image : this.image);
     ctx.save();
     if (this.look.lens && this.hover) {
       ctx.beginPath(); ctx.rect(0, 0, width, height);
@@ -162,6 +156,7 @@ export class Picture {
     }
     names(ctx, [...lines].sort(([a], [b]) => (b.branch === store.chosen) - (a.branch === store.chosen))
       .map(([branch, at]) => [nameOf(branch), at, branch.branch === store.chosen ? "#fff" : colorOf(branch.branch)]));
+    if (store.spot) ring(ctx, ...this.put(store.spot.at[this.number - 1]), 11, "#f0e442");
     const cursor = store.cursor && lines.find(([b]) => b.branch === store.cursor.branch);
     if (cursor) ring(ctx, ...cursor[1][store.cursor.at], 6, "#ffe14d");
   }

@@ -17,6 +17,15 @@ export function status(store) {
     ...[list("Findings and notes", said), list("What no picture can show", summary.silent_errors)].filter(x => x));
 }
 
+/** One line a stated alternative, to be looked at and, where a correction picks it, picked. */
+export function alternatives(store, pick) {
+  const found = store.result?.alternatives ?? [];
+  $("alternatives").hidden = !found.length;
+  $("alternatives").querySelector("ul").replaceChildren(...found.map(one => el("li", {}, one.text,
+    el("button", { type: "button", class: "small", "aria-label": `Show: ${one.text}`, onclick: () => store.show(one) }, "Show"),
+    one.does ? el("button", { type: "button", class: "small", "aria-label": `${one.does}: ${one.text}`, onclick: () => pick(one) }, one.does) : null)));
+}
+
 /** One line a correction, each of which can be taken back by itself. */
 export function corrections(store, say) {
   const now = store.now, lines = [];

@@ -1,5 +1,5 @@
 // The tree in 3D, seen from the detector of a C-arm that is turned by dragging.
-import { colorOf, direction, el, gapAt, inside, label, nameOf, names, pen, ring } from "./dom.js";
+import { colorOf, direction, el, gapAt, inside, label, nameOf, names, pen, ring, saved } from "./dom.js";
 
 const rad = x => x * Math.PI / 180;
 const dot = (p, q) => p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
@@ -21,7 +21,7 @@ export class Scene3D {
     const button = (text, name, act) => el("button", { type: "button", "aria-label": `${name} the tree`, title: name, onclick: act }, text);
     this.root = el("div", { class: "view" }, this.canvas, this.title, el("div", { class: "zoom" },
       button("+", "Zoom in on", () => this.scale(1.3)), button("\u2212", "Zoom out of", () => this.scale(1 / 1.3)),
-      button("\u2302", "Reset", () => this.reset())), this.buttons);
+      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => saved(this.canvas, "tree.png"))), this.buttons);
     this.angles = [0, 0]; this.zoom = 1; this.shift = [0, 0]; this.kind = "branch";
     this.listen();
   }
@@ -121,6 +121,7 @@ export class Scene3D {
       const [x, y] = put(this.store.branch(cursor.branch).points[cursor.at]);
       ring(ctx, x, y, 7, "#ffe14d");
     }
+    if (this.store.spot) ring(ctx, ...put(this.store.spot.place).slice(0, 2), 11, "#f0e442");
     this.compass(ctx, u, v, height);
     ctx.lineWidth = 2; ctx.strokeStyle = "#fff"; ctx.textAlign = "right";
     ctx.beginPath(); ctx.moveTo(width - 14, height - 14); ctx.lineTo(width - 14 - 20 * scale, height - 14); ctx.stroke();

@@ -8,7 +8,7 @@ const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 export class Store extends EventTarget {
   info = null; result = null; job = null; running = false;
-  chosen = 0; cursor = null; ran = null; #past = []; #future = []; #runs = 0; #last = Promise.resolve();
+  chosen = 0; cursor = null; spot = null; ran = null; #past = []; #future = []; #runs = 0; #last = Promise.resolve();
 
   get path() { return `/api/cases/${this.info.id}`; }
   get now() { return corrections(this.info.order); }
@@ -21,7 +21,7 @@ export class Store extends EventTarget {
 
   open(info) {
     this.#runs++; this.running = false;
-    Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null });
+    Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null, spot: null });
     this.#past.length = 0; this.#future.length = 0;
     this.tell("opened");
   }
@@ -82,7 +82,7 @@ export class Store extends EventTarget {
       if (this.result) {
         const branches = this.result.scene.branches;
         this.chosen = branches.some(b => b.branch === this.chosen) ? this.chosen : worst(branches);
-        this.cursor = null;
+        this.cursor = this.spot = null;
       }
       this.tell("finished");
     } finally {
@@ -97,9 +97,11 @@ export class Store extends EventTarget {
     if (this.job && this.running) await api.remove(`/api/jobs/${this.job.id}`);
   }
 
-  choose(branch) { this.chosen = branch; this.cursor = null; this.tell("chosen"); }
+  choose(branch) { this.chosen = branch; this.cursor = this.spot = null; this.tell("chosen"); }
   /** A point of a branch that all drawings mark: its number and the place in its list. */
   point(cursor) { this.cursor = cursor; this.tell("chosen"); }
+  /** A stated alternative, whose place all drawings mark. */
+  show(spot) { if (spot.branches.length) this.chosen = spot.branches[0]; this.cursor = null; this.spot = spot; this.tell("chosen"); }
   branch(number) { return this.result?.scene.branches.find(b => b.branch === number) ?? null; }
 }
 
