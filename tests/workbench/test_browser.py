@@ -172,9 +172,38 @@ def test_phantom_runs_dropped_on_the_page_go_the_whole_way(serve, browse, engine
     assert finished(page) in ("ok", "degraded")
     strips = page.locator("#frames .strip")
     until(page, lambda: strips.count() == 2 and strips.first.locator("button").count() == 9)
-    marks = [np.array(point) for point in told["IM7-IM8"][0]]
+    # Where the upper branch leaves the main tube.
+    marks = [np.array(told["pixels_col_row"][run][2]) for run in ("IM7", "IM8")]
     shorter, order = way_of_a_case(page, cases / "case", [(30, 470), (60, 480), (90, 490)], marks)
     assert repeated_from(engine, cases / "case", order, tmp_path / "again") == shorter
+
+
+@pytest.mark.slow
+def test_a_stated_alternative_is_shown_and_picked(serve, browse):
+    """A probable ghost of a real tree: its place is marked, picking it deletes the branch."""
+    folder = ready_case("P_0001")
+    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
+    address, cases = serve(lambda desk: desk.add(desk.new_folder("case"), given).id)
+    page = browse(address, 1500)
+    finished(page)
+    rows, stated = page.locator("#lesions tbody tr"), page.locator("#alternatives li")
+    before, texts = rows.count(), stated.all_inner_texts()
+    assert "a ghost with probability" in texts[0]
+    tree = page.locator(".view canvas").last
+    unmarked = tree.screenshot()
+    page.click("#alternatives li:first-child button:has-text('Show')")
+    assert tree.screenshot() != unmarked
+    with page.expect_download() as kept:
+        page.click("button[aria-label='Save picture of the tree']")
+    assert Path(kept.value.path()).read_bytes().startswith(b"\x89PNG")
+    raw = page.locator(".view canvas").first.screenshot()
+    page.check("#show-flat")
+    until(page, lambda: page.locator(".view canvas").first.screenshot() != raw)
+    page.click("#alternatives li:first-child button:has-text('Delete')")
+    until_order(page, cases / "case", lambda o: len(o.get("deleted_mm", ())) == 1)
+    until(page, lambda: rows.count() < before)
+    finished(page)
+    assert stated.all_inner_texts() != texts
 
 
 @pytest.mark.slow
