@@ -9,7 +9,7 @@ from gcar_deploy.config.ranges import Count, Range, Share
 
 RefinerName: TypeAlias = Literal["tube", "paper", "none"]
 REFINERS = get_args(RefinerName)
-Backend: TypeAlias = Literal["numpy", "torch"]
+Backend: TypeAlias = Literal["numpy", "numba", "torch"]
 BACKENDS = get_args(Backend)
 Device: TypeAlias = Literal["cpu", "cuda"]
 DEVICES = get_args(Device)
@@ -79,9 +79,22 @@ class PaperOptions:
     least_mass_share: Share = 0.02
     #: stop when the best of so many steps is not better
     patience: Annotated[int, Range(1, 1_000_000)] = 20
-    #: what projects: NumPy, or its reference twin
+    #: what projects: NumPy, compiled loops, or the reference twin
     backend: Backend = "numpy"
     device: Device = "cpu"
+
+
+#: as printed: 10,000 Gaussians to begin with, whom density control may add to, up to 8,000
+#: iterations; what is not printed is as in ``PaperOptions``
+PRINTED = PaperOptions(
+    steps=8_000, control_every=100, patience=8_000, most_gaussians=20_000, least_confidence=0.0
+)
+#: as in the code that was released: plain L2, rates of 1.6e-4 of the cube's 180 mm (falling to 0.29
+#: of it), 0.005 (log scale), 0.001 (rotation) and 0.01 (intensity)
+RELEASED = dataclasses.replace(
+    PRINTED, alpha=1.0, rate_mean_mm=0.029, rate_scale=0.005, rate_rotation=0.001,
+    rate_intensity=0.01, final_rate=0.29, patience=600,
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,8 @@
-"""What projects Gaussians and pulls gradients back: NumPy, or its torch twin on CPU or GPU.
+"""What projects Gaussians and pulls gradients back: NumPy, numba, or torch on CPU or GPU.
 
-The twin is dense and differentiates itself; NumPy cuts each Gaussian off at four standard
-deviations, beyond which 3e-4 of its peak lies. Pictures agree within ``PICTURE_TOLERANCE`` of
-their peak, gradients within ``GRADIENT_TOLERANCE`` of their norm.
+Numba runs NumPy's sums as compiled loops. Torch is dense and differentiates itself; NumPy cuts each
+Gaussian off at four standard deviations, beyond which 3e-4 of its peak lies. Pictures agree within
+``PICTURE_TOLERANCE`` of their peak, gradients within ``GRADIENT_TOLERANCE`` of their norm.
 """
 
 from __future__ import annotations
@@ -45,6 +45,13 @@ def backend_named(name: str, device: str = "cpu") -> Backend:
         if device != "cpu":
             raise UsageError(f"device {device} needs the backend torch; numpy runs on cpu")
         return Backend(project=project, vjp=project_vjp)
+    if name == "numba":
+        if device != "cpu":
+            raise UsageError(f"device {device} needs the backend torch; numba runs on cpu")
+        from gcar_deploy.gaussians import numba_project
+
+        numba_project.check_numba()
+        return Backend(project=numba_project.project_compiled, vjp=numba_project.vjp_compiled)
     from gcar_deploy.gaussians import torch_project as twin
 
     twin.check_device(device)

@@ -1,7 +1,7 @@
 """The paper's refinement loss: projection L2 and L2 on the projected centreline.
 
-L_G = sum over views of alpha ||P^ - P||^2 + (1 - alpha) ||(P^ - P) M_cl||^2 (3DGR-CAR, eq. 3),
-each norm as the mean over its own pixels, so that the weights mean the same at every size.
+L_G = sum over views of alpha ||P^ - P||^2 + (1 - alpha) ||(P^ - P) M_cl||^2 (3DGR-CAR, eq. 3), both
+norms as sums over pixels, as printed: at alpha = 0.5 a pixel of the skeleton weighs twice another.
 """
 
 from __future__ import annotations
@@ -29,9 +29,5 @@ def projection_loss(
     gradient : (rows, cols) mm
     """
     r = np.asarray(made, dtype=np.float64) - picture
-    weight = np.zeros(r.shape)
-    for share, pixels in ((alpha, valid), (1.0 - alpha, skeleton & valid)):
-        count = np.count_nonzero(pixels)
-        if count:
-            weight[pixels] += share / count
+    weight = np.where(valid, alpha + (1.0 - alpha) * skeleton, 0.0)
     return float(np.sum(weight * r * r)), 2.0 * weight * r

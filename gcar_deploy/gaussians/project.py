@@ -115,12 +115,12 @@ def _to_parameters(g: Gaussians, f: Footprint, g0: Scalars, g1: Array, g2: Array
     return Gradient(
         means_mm=by_mean * f.seen[:, None],
         log_scales=by_log_scale * f.seen[:, None],
-        quaternions_wxyz=_by_quaternion(g.quaternions_wxyz, by_R) * f.seen[:, None],
+        quaternions_wxyz=by_quaternion(g.quaternions_wxyz, by_R) * f.seen[:, None],
         intensity=g0 * f.unit_amplitude * f.seen,
     )
 
 
-def _by_quaternion(quaternions: Array, by_R: Array) -> Array:
+def by_quaternion(quaternions: Array, by_R: Array) -> Array:
     """(n, 4) gradient by (w, x, y, z) through the normalisation; zero quaternions get none."""
     length = np.linalg.norm(quaternions, axis=1)
     safe = np.maximum(length, 1e-12)

@@ -1,4 +1,4 @@
-"""The torch twin behind the refiner gives what NumPy gives, within the stated tolerance."""
+"""The twins behind the refiner give what NumPy gives, within the stated tolerance."""
 
 import dataclasses
 
@@ -19,14 +19,36 @@ from tests.gaussians.test_project import carm, random_gaussians
 @pytest.mark.parametrize(
     ("name", "device", "words"),
     [
-        ("jax", "cpu", "one of numpy, torch"),
+        ("jax", "cpu", "one of numpy, numba, torch"),
         ("torch", "tpu", "one of cpu, cuda"),
         ("numpy", "cuda", "needs the backend torch"),
+        ("numba", "cuda", "needs the backend torch"),
     ],
 )
 def test_what_is_not_there_is_said(name, device, words):
     with pytest.raises(UsageError, match=words):
         backend_named(name, device)
+
+
+def test_compiled_loops_are_the_same_sums():
+    """The same windows, so rounding alone: also behind the source, off the picture, unturned."""
+    pytest.importorskip("numba")
+    numpy, numba = backend_named("numpy"), backend_named("numba")
+    g = random_gaussians(60, 3, spread=60)
+    quaternions, means = g.quaternions_wxyz.copy(), g.means_mm.copy()
+    quaternions[5] = 0
+    view = carm(48, 3.7, 30.0, 20.0)
+    means[9] = 2 * view.source_mm
+    means[11] += 1e4
+    g = dataclasses.replace(g, means_mm=means, quaternions_wxyz=quaternions)
+    picture = numpy.project(g, view)
+    assert picture.max() > 0
+    np.testing.assert_allclose(numba.project(g, view), picture, atol=1e-12 * picture.max())
+    by_picture = np.random.default_rng(0).normal(size=picture.shape)
+    expected, found = numpy.vjp(g, view, by_picture), numba.vjp(g, view, by_picture)
+    for field in dataclasses.fields(expected):
+        a, b = getattr(found, field.name), getattr(expected, field.name)
+        assert np.abs(a - b).max() <= 1e-11 * np.abs(b).max(), field.name
 
 
 def devices():
