@@ -360,11 +360,17 @@ def pose_table(trees: int, out: Path) -> None:
 @click.option("--seed", type=int, help="Of the generated pictures and the crops.")
 @click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
 @click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
-@click.option("--warm-start", type=_FILE, help="Checkpoint whose weights to begin with.")
+@click.option("--real-share", type=float, help="Of the pictures of a step, where there are any.")
+@click.option("--pictures", type=int, help="Generated ones that are drawn; each is used often.")
+@click.option(
+    "--pool", type=click.Path(path_type=Path), help="Folder that keeps them, for several runs."
+)
+@click.option("--warm-start", type=_FILE, help="Checkpoint or ONNX model to begin with.")
 @click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
 def train_segmenter(
-    out: Path, preset: str, warm_start: Path | None, minutes: float | None, **given: Any
-) -> None:
+    out: Path, preset: str, warm_start: Path | None, pool: Path | None, minutes: float | None,
+    **given: Any,
+) -> None:  # fmt: skip
     """Train the segmentation network on generated and real angiograms; stop and go on at will.
 
     Options that are not given are those of the preset: two CPU cores for an hour, or a GPU.
@@ -375,7 +381,7 @@ def train_segmenter(
 
     options = training.chosen(preset, {k: v for k, v in given.items() if v is not None})
     workers = (os.cpu_count() or 1) if options.device != "cpu" else 1
-    training.train(out, options, minutes=minutes, workers=workers, begin_from=warm_start)
+    training.train(out, options, minutes=minutes, workers=workers, begin_from=warm_start, pool=pool)
 
 
 @main.command("export-segmenter")

@@ -13,6 +13,7 @@ import numpy as np
 
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.net import net_input
+from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.types import Array, Image, Mask
 from gcar_export.scenes.angiogram_scenery import displayed, exposed, moved, scenery
 from gcar_export.scenes.angiogram_vessels import catheter, random_vessels
@@ -23,9 +24,8 @@ SURE_PX, PERHAPS_PX = 0.8, 0.25
 #: attenuation that is too little to be drawn by anyone
 FAINT = 0.02
 #: pictures with nothing but vessels, of any contrast; of the others, how many show a catheter; and
-#: how much a pixel of a device counts where vessels are asked for: not to lose a vessel to a
-#: look-alike
-PLAIN, CATHETERS, DEVICE_WEIGHT = 0.15, 0.65, 0.5
+#: how much a pixel of a device counts where vessels are asked for
+PLAIN, CATHETERS, DEVICE_WEIGHT = 0.15, 0.65, 1.0
 #: attenuation of the contrast agent, 1/mm: hardly seen to saturated
 CONTRAST = (0.03, 0.5)
 #: size of a pixel, mm: fields of 80 to 240 mm at the size that the network looks at
@@ -135,21 +135,28 @@ def network_input(pixels: Array) -> tuple[Array, Mask]:
     return net_input(enhance.absorbance(counts / np.float32(white)), holes), holes
 
 
+def asked_of(made: GeneratedAngiogram) -> Array:
+    """(6, SIDE, SIDE) float32, what is asked where; see ``training_pair``."""
+    weight = np.where(made.unsure, 0.0, 1.0)
+    weight[made.device] = DEVICE_WEIGHT
+    known = np.where(made.path_px > PERHAPS_PX, np.where(made.mask, 1.0, 0.0), 1.0)
+    line = skeletonize(made.mask)
+    layers = [made.mask, weight, made.path_px, made.device, known, line]
+    return np.stack(layers).astype(np.float32)
+
+
 def training_pair(seed: int, index: int) -> tuple[Array, Array]:
     """Return the network's input and truth of a picture, flipped at random.
 
     Returns
     -------
     channels : (CHANNELS, SIDE, SIDE) float32
-    truth : (5, SIDE, SIDE) float32: vessel, weight of a pixel for that question, chord in pixel
-        edges, device, weight of that question
+    truth : (6, SIDE, SIDE) float32: vessel, weight of a pixel for that question, chord in pixel
+        edges, device, weight of that question, centreline of the vessels
     """
     made = generated_angiogram(seed, index)
     channels, holes = network_input(made.pixels)
-    weight = np.where(made.unsure, 0.0, 1.0)
-    weight[made.device] = DEVICE_WEIGHT
-    known = np.where(made.path_px > PERHAPS_PX, np.where(made.mask, 1.0, 0.0), 1.0)
-    truth = np.stack([made.mask, weight, made.path_px, made.device, known]).astype(np.float32)
+    truth = asked_of(made)
     truth[:, holes] = 0.0
     turn = np.random.default_rng([seed, index, 2]).integers(0, 2, 3)
     for axis in range(2):

@@ -7,10 +7,10 @@ chord is that of round vessels as wide as drawn, and nothing is asked of devices
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from gcar_deploy.errors import ImageError
@@ -18,12 +18,10 @@ from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import SIDE as NETWORK_SIDE
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.types import Array, Image, Mask
-from gcar_export.scenes.angiograms import SIDE, network_input
+from gcar_export.scenes.augmented import Labelled, augmented_pair
 
 #: pixels of a crop for one of the picture at the network's size
 ZOOM = (0.75, 1.6)
-#: of ten crops this many lie straight; the others are turned by up to so much
-STRAIGHT, TURN_DEG = 4, 40.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,6 +40,15 @@ class ExpertPicture:
     pixels: Image
     mask: Mask
     path_px: Image
+
+    @functools.cached_property
+    def labelled(self) -> Labelled:
+        """The picture with what is asked: nothing of devices."""
+        ones = np.ones_like(self.path_px)
+        layers = [self.mask, ones, self.path_px, 0 * ones, 0 * ones, 0 * ones]
+        scale = NETWORK_SIDE / float(np.sqrt(self.mask.size))
+        asked = np.stack(layers).astype(np.float32)
+        return Labelled(self.pixels, asked, (scale * ZOOM[0], scale * ZOOM[1]))
 
 
 def expert_pictures(folder: Path) -> tuple[ExpertPicture, ...]:
@@ -83,57 +90,6 @@ def folds(
 
 
 def expert_pair(pictures: Sequence[ExpertPicture], seed: int, index: int) -> tuple[Array, Array]:
-    """Return the network's input and truth of a crop, as ``angiograms.training_pair`` does.
-
-    The picture is turned, flipped, zoomed, shifted, its grey values bent, blurred and made noisy.
-    """
+    """Return the network's input and truth of a crop, as ``augmented.augmented_pair`` does."""
     rng = np.random.default_rng([seed, index, 3])
-    chosen = pictures[int(rng.integers(len(pictures)))]
-    move, zoom = _placed(rng, chosen.mask.shape)
-    size = (SIDE, SIDE)
-    pixels = cv2.warpAffine(
-        chosen.pixels, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-    )
-    mask, path, inside = (
-        cv2.warpAffine(np.asarray(a, np.float32), move, size, flags=cv2.INTER_LINEAR)
-        for a in (chosen.mask, chosen.path_px * np.float32(zoom), np.ones_like(chosen.pixels))
-    )
-    channels, holes = network_input(_regraded(rng, np.asarray(pixels, np.float32)))
-    asked = (inside > 0.99) & ~holes
-    truth = np.stack([mask >= 0.5, asked, path * asked, 0 * path, 0 * path])
-    return channels, np.ascontiguousarray(truth, dtype=np.float32)
-
-
-def _placed(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[Array, float]:
-    """(2, 3) affine map from the picture to the crop, and its enlargement."""
-    rows, columns = shape
-    zoom = float(np.exp(rng.uniform(*np.log(ZOOM)))) * NETWORK_SIDE / np.sqrt(rows * columns)
-    turned = rng.integers(10) >= STRAIGHT
-    angle = np.radians(rng.uniform(-TURN_DEG, TURN_DEG) if turned else 0.0)
-    linear = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * zoom
-    linear[:, 0] *= rng.choice([-1, 1])
-    linear[:, 1] *= rng.choice([-1, 1])
-    if rng.integers(2):
-        linear = linear[:, ::-1]
-    # The crop lies within the picture as far as it can.
-    free = np.maximum(np.array([columns, rows]) - SIDE / zoom, 0.0) / 2
-    middle = np.array([columns - 1, rows - 1]) / 2 + rng.uniform(-1, 1, 2) * free
-    offset = (SIDE - 1) / 2 - linear @ middle
-    return np.column_stack([linear, offset]), zoom
-
-
-def _regraded(rng: np.random.Generator, pixels: Image) -> Image:
-    """Bend the grey values, blur or sharpen, add noise, at times through JPEG."""
-    top = max(float(pixels.max()), 1.0)
-    out = (np.clip(pixels, 0, None) / np.float32(top)) ** np.float32(np.exp(rng.normal(0, 0.3)))
-    if rng.random() < 0.5:
-        wide = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.5, 3.0))
-        out = out + np.float32(rng.uniform(-0.7, 1.0)) * (out - wide)
-    if rng.random() < 0.5:
-        out = out + rng.normal(0, rng.uniform(0.003, 0.025), out.shape).astype(np.float32)
-    low, high = rng.uniform(0, 50), rng.uniform(180, 255)
-    grey = np.clip(low + (high - low) * out, 0, 255).round().astype(np.uint8)
-    if rng.random() < 0.2:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(40, 95))]
-        grey = cv2.imdecode(cv2.imencode(".jpg", grey, quality)[1], cv2.IMREAD_UNCHANGED)
-    return np.asarray(grey, dtype=np.float32)
+    return augmented_pair(rng, pictures[int(rng.integers(len(pictures)))].labelled)

@@ -26,11 +26,16 @@ from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import UsageError
 from gcar_export.scenes.angiograms import SIDE, training_pair
+from gcar_export.scenes.augmented import augmented_pair
 from gcar_export.scenes.expert_pictures import ExpertPicture, expert_pair, expert_pictures, folds
+from gcar_export.scenes.picture_pool import pooled
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
+from gcar_export.training.segmenter_start import begin_with, weights
 
 #: pictures with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
+#: stream of the pictures that are learned from, and how many new ones a step may meet
+POOL_SEED, FRESH = 1, 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,14 +49,15 @@ class SegmenterOptions:
     real : str, folder of real angiograms with expert masks (``expert_pictures``); empty for none
     fold : (number, of how many) that is left out of them; (0, 0) leaves none out
     real_share : float, of the pictures of a step, where there are real ones
+    pictures : int, generated ones that are drawn; each is used many times, never twice the same
     crop : int, side of what is cut out of a picture, pixels; a multiple of the network's stride
     """
 
     seed: int = 1
-    steps: int = 2500
-    decay_steps: int = 1700
+    steps: int = 2000
+    decay_steps: int = 1500
     warmup_steps: int = 50
-    batch: int = 8
+    batch: int = 6
     learning_rate: float = 2e-3
     weight_decay: float = 1e-4
     validation_pictures: int = 40
@@ -61,19 +67,33 @@ class SegmenterOptions:
     real: str = ""
     fold: tuple[int, int] = (0, 0)
     real_share: float = 0.5
-    crop: int = SIDE
+    pictures: int = 1500
+    crop: int = 224
 
 
 #: two cores for an hour; a GPU with the cores to draw pictures for it
 PRESETS = {
     "cpu": SegmenterOptions(),
     "gpu": SegmenterOptions(
-        steps=20_000, decay_steps=12_000, warmup_steps=500, batch=48, device="cuda", save_every=500
+        steps=20_000,
+        decay_steps=12_000,
+        warmup_steps=500,
+        batch=48,
+        pictures=20_000,
+        device="cuda",
+        save_every=500,
     ),
 }
 #: three steps, for tests
 TINY = SegmenterOptions(
-    steps=3, decay_steps=1, warmup_steps=1, batch=1, validation_pictures=2, save_every=2
+    steps=3,
+    decay_steps=1,
+    warmup_steps=1,
+    batch=1,
+    validation_pictures=2,
+    save_every=2,
+    pictures=2,
+    crop=128,
 )
 
 
@@ -121,6 +141,15 @@ def mask_loss(logits: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor) -
     return bce + dice.mean()
 
 
+def line_loss(logits: torch.Tensor, line: torch.Tensor) -> torch.Tensor:
+    """Share of each picture's centreline that is not found (Kirchhoff et al. 2024).
+
+    Thin vessels have as much of it as wide ones, but hardly any area.
+    """
+    found = (torch.sigmoid(logits) * line).sum((1, 2))
+    return (1 - (found + 1) / (line.sum((1, 2)) + 1)).mean()
+
+
 def chord_loss(chords: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """Relative error of (n, rows, cols) chords in pixel edges, on the scale of log(1 + chord).
 
@@ -135,10 +164,11 @@ def chord_loss(chords: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor) 
 
 
 def total_loss(out: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """Of (n, 3, rows, cols) answers against (n, 5, rows, cols) truths of ``training_pair``."""
-    mask, weight, chord, device, known = truth.unbind(1)
+    """Of (n, 3, rows, cols) answers against (n, 6, rows, cols) truths of ``training_pair``."""
+    mask, weight, chord, device, known, line = truth.unbind(1)
     vessel = mask_loss(out[:, 0], mask, weight) + 2 * chord_loss(out[:, 1], chord, weight)
-    return vessel + 0.5 * mask_loss(out[:, 2], device, known)
+    lost = 0.5 * line_loss(out[:, 0], line)
+    return vessel + lost + 0.5 * mask_loss(out[:, 2], device, known)
 
 
 class Stream(torch.utils.data.Dataset):
@@ -147,8 +177,10 @@ class Stream(torch.utils.data.Dataset):
     Of each ``batch`` the first ``real_share`` are crops of real pictures, where there are any.
     """
 
-    def __init__(self, options: SegmenterOptions, real: Sequence[ExpertPicture] = ()) -> None:
-        self.options, self.real = options, real
+    def __init__(
+        self, options: SegmenterOptions, pool: Path, real: Sequence[ExpertPicture] = ()
+    ) -> None:
+        self.options, self.pool, self.real = options, pool, real
 
     def __len__(self) -> int:
         return self.options.steps * self.options.batch
@@ -159,7 +191,11 @@ class Stream(torch.utils.data.Dataset):
         if self.real and index % batch < round(self.options.real_share * batch):
             x, y = expert_pair(self.real, seed, index)
         else:
-            x, y = training_pair(seed, index)
+            rng = np.random.default_rng([seed, index, 5])
+            # The first steps need not wait for the whole pool.
+            drawn = min(self.options.pictures, batch + FRESH * (index // batch))
+            chosen = pooled(self.pool, POOL_SEED, int(rng.integers(drawn)))
+            x, y = augmented_pair(rng, chosen)
         top, left = np.random.default_rng([seed, index, 4]).integers(
             0, SIDE - self.options.crop + 1, 2
         )
@@ -168,15 +204,16 @@ class Stream(torch.utils.data.Dataset):
 
 
 def batches(
-    options: SegmenterOptions, real: Sequence[ExpertPicture], first_step: int, workers: int
-) -> Iterator[list[torch.Tensor]]:
-    """Yield inputs (batch, 3, n, n) and truths (batch, 5, n, n) of each step from the first on."""
+    options: SegmenterOptions, pool: Path, real: Sequence[ExpertPicture], first_step: int,
+    workers: int,
+) -> Iterator[list[torch.Tensor]]:  # fmt: skip
+    """Yield inputs (batch, 3, n, n) and truths (batch, 6, n, n) of each step from the first on."""
     order = [
         list(range(k * options.batch, (k + 1) * options.batch))
         for k in range(first_step, options.steps)
     ]
     yield from torch.utils.data.DataLoader(
-        Stream(options, real), batch_sampler=order, num_workers=workers
+        Stream(options, pool, real), batch_sampler=order, num_workers=workers
     )
 
 
@@ -213,13 +250,13 @@ def real_pictures(options: SegmenterOptions) -> tuple[ExpertPicture, ...]:
 
 def train(
     out: Path, options: SegmenterOptions, *, minutes: float | None = None, workers: int = 1,
-    begin_from: Path | None = None,
+    begin_from: Path | None = None, pool: Path | None = None,
 ) -> None:  # fmt: skip
     """Train or go on training in ``out``; stop after ``minutes`` if given.
 
     The decay is a function of the step, so a run cut short has not settled: ``finish`` it by a
-    call with fewer ``steps``. A new run begins with the weights of the checkpoint ``begin_from``
-    if given.
+    call with fewer ``steps``. A new run begins with the weights of ``begin_from`` if given, a
+    checkpoint or an ONNX model. Generated pictures are kept in ``pool``, by default in ``out``.
     """
     out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
@@ -228,8 +265,11 @@ def train(
     net = MaskUNet(MaskUNetConfig()).to(options.device).train()
     # channels_last only orders the memory; the stubs of Module.to do not know it
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    started = None
     if begin_from is not None:
-        net.load_state_dict(_weights(load_file(begin_from)))
+        started = begin_with(net, begin_from)
+    elif (out / "manifest.json").exists():
+        started = json.loads((out / "manifest.json").read_text()).get("warm_start")
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
@@ -237,7 +277,7 @@ def train(
     began, losses = time.time(), []
     with click.progressbar(length=options.steps, label="segmenter", file=sys.stderr) as bar:
         bar.update(step)
-        for x, y in batches(options, real, step, workers):
+        for x, y in batches(options, pool or out / "pool", real, step, workers):
             if minutes is not None and time.time() - began > 60 * minutes:
                 break
             for group in optimiser.param_groups:
@@ -246,8 +286,8 @@ def train(
             step += 1
             bar.update(1)
             if step % options.save_every == 0:
-                _checkpoint(out, net, optimiser, step, options, losses, None)
-    _checkpoint(out, net, optimiser, step, options, losses, validate(net, options))
+                _checkpoint(out, net, optimiser, step, options, losses, None, started)
+    _checkpoint(out, net, optimiser, step, options, losses, validate(net, options), started)
 
 
 def _step(
@@ -266,16 +306,12 @@ def _step(
     return float(loss.detach())
 
 
-def _weights(data: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {k[4:]: v for k, v in data.items() if k.startswith("net.")}
-
-
 def _resume(out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer) -> int:
     path = out / "checkpoint.safetensors"
     if not path.exists():
         return 0
     data = load_file(path)
-    net.load_state_dict(_weights(data))
+    net.load_state_dict(weights(data))
     state = {}
     for n, (name, _) in enumerate(net.named_parameters()):
         if f"opt.{name}.exp_avg" in data:
@@ -288,6 +324,7 @@ def _resume(out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer) -> int:
 def _checkpoint(
     out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer, step: int,
     options: SegmenterOptions, losses: Sequence[float], dice: float | None,
+    started: str | None,
 ) -> None:  # fmt: skip
     data = {f"net.{k}": v.detach().clone().contiguous() for k, v in net.state_dict().items()}
     for name, p in net.named_parameters():
@@ -301,8 +338,9 @@ def _checkpoint(
         "network": "mask-unet",
         "config": dataclasses.asdict(net.config),
         "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
-        "data": "generated angiograms: gcar_export.scenes.angiograms, picture step * batch + k"
+        "data": "generated angiograms: gcar_export.scenes.picture_pool"
         + ("; crops of real ones with expert masks" if options.real else ""),
+        "warm_start": started,
         "step": step,
         "validation_seed": VALIDATION_SEED,
         "validation_dice": dice,

@@ -25,24 +25,29 @@ from gcar_deploy.predict.kinds import read_predictor  # noqa: E402
 from gcar_export.scenes.angiogram_vessels import Vessels, catheter, random_vessels, ribbon  # noqa: E402
 from gcar_export.scenes.angiograms import (  # noqa: E402
     SIDE,
+    asked_of,
     generated_angiogram,
     picture_with_mask,
     training_pair,
 )
+from gcar_export.scenes.augmented import Labelled, augmented_pair  # noqa: E402
 from gcar_export.scenes.expert_pictures import expert_pair, expert_pictures, folds  # noqa: E402
+from gcar_export.scenes.picture_pool import pooled  # noqa: E402
 from gcar_export.shipping.export_segmenter import _GroupNorm, export_segmenter  # noqa: E402
-from gcar_export.training.networks.mask_unet import MaskUNet  # noqa: E402
+from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig  # noqa: E402
 from gcar_export.training.segmenter import (  # noqa: E402
     TINY,
     Stream,
     chord_loss,
     chosen,
     learning_rate,
+    line_loss,
     mask_loss,
     real_pictures,
     total_loss,
     train,
 )
+from gcar_export.training.segmenter_start import begin_with  # noqa: E402
 from tests.imaging.phantoms import angiogram, raw_picture, tube_paths  # noqa: E402
 
 
@@ -104,9 +109,10 @@ def test_input_and_truth_belong_together():
     for i in range(4):
         channels, truth = training_pair(7, i)
         assert channels.shape == (3, SIDE, SIDE) and channels.dtype == np.float32
-        assert truth.shape == (5, SIDE, SIDE) and truth.dtype == np.float32
-        vessel, asked, chord, device, known = truth
-        assert set(np.unique(vessel)) <= {0.0, 1.0} and set(np.unique(asked)) <= {0.0, 0.5, 1.0}
+        assert truth.shape == (6, SIDE, SIDE) and truth.dtype == np.float32
+        vessel, asked, chord, device, known, line = truth
+        assert set(np.unique(vessel)) <= {0.0, 1.0} and set(np.unique(asked)) <= {0.0, 1.0}
+        assert 0 < line.sum() < 0.5 * vessel.sum() and (vessel[line > 0] == 1).all()
         assert (chord[vessel > 0] > 0.5).all() and (asked[vessel > 0] == 1).all()
         assert not (vessel * device).any() and (known[vessel + device > 0] == 1).all()
         on, off = channels[:, vessel > 0].mean(axis=1), channels[:, chord == 0].mean(axis=1)
@@ -136,10 +142,13 @@ def test_losses_are_least_at_the_truth():
     chord = 5 * torch.rand(2, 20, 20)
     assert chord_loss(chord, chord, weight) == 0 < chord_loss(chord + 0.1, chord, weight)
     both = torch.stack([right, chord, -right], 1)
-    truths = torch.stack([truth, weight, chord, 1 - truth, weight], 1)
+    line = truth * (torch.rand(2, 20, 20) > 0.5)
+    truths = torch.stack([truth, weight, chord, 1 - truth, weight, line], 1)
     assert total_loss(both, truths) < 0.1
+    assert line_loss(right, line) < 0.01 < 0.95 < line_loss(-right, line)
+    assert line_loss(-right, 0 * line) == 0  # nothing to find, nothing lost
     # Of devices in a real picture nothing is known, so nothing is asked.
-    unknown = torch.stack([truth, weight, chord, 0 * truth, 0 * weight], 1)
+    unknown = torch.stack([truth, weight, chord, 0 * truth, 0 * weight, line], 1)
     torch.testing.assert_close(
         total_loss(torch.stack([right, chord, right], 1), unknown), total_loss(both, unknown)
     )
@@ -258,8 +267,8 @@ def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
     seen = 0
     for index in range(8):
         channels, truth = expert_pair(pictures, 1, index)
-        assert channels.shape == (3, SIDE, SIDE) and truth.shape == (5, SIDE, SIDE)
-        vessel, asked, chord, device, known = truth
+        assert channels.shape == (3, SIDE, SIDE) and truth.shape == (6, SIDE, SIDE)
+        vessel, asked, chord, device, known, _ = truth
         assert not device.any() and not known.any() and (chord[asked == 0] == 0).all()
         inner = (cv2.erode(vessel, np.ones((5, 5))) > 0) & (asked > 0)
         outer = (cv2.dilate(vessel, np.ones((9, 9))) == 0) & (asked > 0)
@@ -270,12 +279,60 @@ def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
     assert seen >= 2
 
 
-def test_a_step_holds_real_and_generated_pictures(drawn):
+def test_a_step_holds_real_and_generated_pictures(drawn, tmp_path):
     options = dataclasses.replace(TINY, batch=4, real=str(drawn), real_share=0.5, crop=128)
-    stream = Stream(options, real_pictures(options))
+    stream = Stream(options, tmp_path, real_pictures(options))
     known = [float(stream[k][1][4].sum()) for k in range(4)]
     assert known[:2] == [0, 0] and min(known[2:]) > 0
-    assert stream[0][0].shape == (3, 128, 128) and stream[3][1].shape == (5, 128, 128)
+    assert stream[0][0].shape == (3, 128, 128) and stream[3][1].shape == (6, 128, 128)
+    assert len(list(tmp_path.iterdir())) <= TINY.pictures
+
+
+def test_a_pooled_picture_is_drawn_once_and_never_used_twice_alike(tmp_path):
+    one = pooled(tmp_path, 5, 0)
+    again = pooled(tmp_path, 5, 0)
+    made = generated_angiogram(5, 0)
+    for found in (one, again):
+        np.testing.assert_array_equal(found.pixels, made.pixels)
+        np.testing.assert_allclose(found.asked, asked_of(made), rtol=1e-3, atol=1e-4)
+    assert len(list(tmp_path.iterdir())) == 1
+    pairs = [augmented_pair(np.random.default_rng(k), one) for k in (0, 0, 1)]
+    np.testing.assert_array_equal(pairs[0][0], pairs[1][0])
+    assert (pairs[0][0] != pairs[2][0]).any()
+
+
+def test_picture_and_truth_are_moved_alike():
+    """Of a disc the area grows with the square of the zoom, its chord with the zoom."""
+    disc = np.hypot(*(np.indices((256, 256)) - 127.5)) < 30
+    asked = np.stack([disc, disc | True, 40 * disc, disc & False, disc | True, disc & False])
+    pixels = np.where(disc, 60.0, 180.0).astype(np.float32)
+    for k in range(6):
+        zoom = 0.8 + 0.1 * k
+        given = Labelled(pixels, asked.astype(np.float32), (zoom, zoom + 1e-6))
+        channels, truth = augmented_pair(np.random.default_rng(k), given)
+        assert truth[0].sum() == pytest.approx(zoom**2 * disc.sum(), rel=0.2)
+        assert truth[2].max() == pytest.approx(40 * zoom, rel=1e-3)
+        inside = truth[1] > 0
+        assert (
+            channels[1][(truth[0] > 0) & inside].mean()
+            > channels[1][(truth[0] == 0) & inside].mean()
+        )
+
+
+@pytest.mark.slow
+def test_a_model_gives_its_weights_back(trained):
+    from safetensors.torch import load_file
+
+    net, other = MaskUNet(), MaskUNet()
+    begin_with(net, trained / "tiny.onnx")
+    begin_with(other, trained / "run" / "checkpoint.safetensors")
+    for name, value in load_file(trained / "run" / "checkpoint.safetensors").items():
+        if name.startswith("net."):
+            torch.testing.assert_close(net.state_dict()[name[4:]], value)
+            torch.testing.assert_close(other.state_dict()[name[4:]], value)
+    small = MaskUNet(MaskUNetConfig(width=(16, 32, 48, 96)))
+    with pytest.raises(ModelError, match=r"does not hold|channels"):
+        begin_with(small, trained / "tiny.onnx")
 
 
 def test_size_of_the_network():

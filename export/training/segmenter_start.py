@@ -1,0 +1,67 @@
+"""Weights that a training of the segmenter begins with: of a checkpoint, or of an ONNX model."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+
+from gcar_deploy.errors import ModelError
+from gcar_export.training.networks.mask_unet import MaskUNet
+
+_PREFIX = "net."
+
+
+def weights(data: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return the network's part of a checkpoint."""
+    return {k.removeprefix(_PREFIX): v for k, v in data.items() if k.startswith(_PREFIX)}
+
+
+def begin_with(net: MaskUNet, path: Path) -> str:
+    """Load what ``path`` holds into ``net`` and return the file's SHA-256.
+
+    A model that says nothing of devices yet leaves that row of the head as it is.
+
+    Raises
+    ------
+    ModelError
+        A weight is missing or has another shape.
+    """
+    found = _of_onnx(path) if path.suffix == ".onnx" else weights(load_file(path))
+    own = net.state_dict()
+    for name, value in own.items():
+        given = found.get(name)
+        rows = 0 if given is None else given.shape[0]
+        if given is None or given.shape[1:] != value.shape[1:] or rows > value.shape[0]:
+            raise ModelError(f"{path.name} does not hold {name} of shape {tuple(value.shape)}")
+        if rows < value.shape[0] and not name.startswith("head."):
+            raise ModelError(f"{path.name}: {name} has {rows} channels, not {value.shape[0]}")
+        value[:rows] = given
+    net.load_state_dict(own)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _of_onnx(path: Path) -> dict[str, torch.Tensor]:
+    """Convolutions keep their names; what scales and shifts after each follows in its order."""
+    import onnx
+    from onnx import numpy_helper
+
+    graph = onnx.load(str(path)).graph
+    arrays = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
+    found = {k.removeprefix(_PREFIX): v for k, v in arrays.items() if k.startswith(_PREFIX)}
+    layer = ""
+    for node in graph.node:
+        held = [name for name in node.input if name in arrays]
+        if node.op_type == "Conv" and f"{_PREFIX}head.weight" in held:
+            break
+        if node.op_type == "Conv":
+            block, number = held[0].removesuffix(".weight").removeprefix(_PREFIX).rsplit(".", 1)
+            layer = f"{block}.{int(number) + 1}"
+        for name in held:
+            if layer and node.op_type in ("Mul", "Add") and arrays[name].ndim == 4:
+                part = "weight" if node.op_type == "Mul" else "bias"
+                found[f"{layer}.{part}"] = arrays[name].reshape(-1)
+    return {k: torch.from_numpy(np.array(v, np.float32)) for k, v in found.items()}
