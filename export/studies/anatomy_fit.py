@@ -94,7 +94,7 @@ def fit(figures: Array) -> Usual:
     import torch
 
     torch.manual_seed(0)
-    scale = np.sqrt(np.mean(figures**2, axis=0))
+    scale: Scalars = np.sqrt(np.mean(figures**2, axis=0)).round(6)
     signs = np.stack([odd_signs((1, 1, 1)), *(odd_signs(axes) for axes, _ in MISTAKES.values())])
     seen = torch.tensor(figures / scale, dtype=torch.float32)
     turned = torch.tensor(signs, dtype=torch.float32)
@@ -116,7 +116,7 @@ def fit(figures: Array) -> Usual:
     weight, offset, out = (p.detach().double().numpy() for p in net.parameters())
     # As many digits as the file keeps, so that the lines hold for what it says.
     weight = np.round(np.column_stack([weight, offset]), 4)
-    return Usual(np.round(scale, 6), weight, np.round(out[0], 4), {})
+    return Usual(scale, weight, np.round(out[0], 4), {})
 
 
 def with_lines(usual: Usual, right: Array) -> Usual:

@@ -22,6 +22,7 @@ from gcar_deploy.quality.scale import check_scale, mean_factor, scale_factor
 from gcar_deploy.types import Image
 from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.scenes.render import path_lengths
+from gcar_export.scenes.stenosis_cases import Tube
 from gcar_export.scenes.trees import SIDES, random_tree, rough_style, thin_style
 from gcar_export.scenes.true_trees import joined_tree
 
@@ -48,7 +49,8 @@ def judged(trees: int) -> Iterator[tuple[float, float, float | None, bool]]:
         rng = np.random.default_rng([SEED, number])
         style = (None, rough_style(rng), thin_style(rng))[rng.choice(3, p=[0.45, 0.45, 0.1])]
         truth = random_tree(rng, style).sides(SIDES[number % 2])
-        tree, carms = joined_tree(truth.vessels), clinical_geometry(2)[0]
+        tree = joined_tree([Tube(v.name, v.points_mm, v.radius_mm) for v in truth.vessels])
+        carms = clinical_geometry(2)[0]
         paths = [path_lengths(carm, *truth.segments()) for carm in carms]
         for blur in BLURS_PX:
             blurred = [gaussian_filter(path, blur) if blur else path for path in paths]

@@ -119,7 +119,8 @@ def examined(
     engine: Engine, case: Exam, what: tuple[str, str, str], told: Told, right: Row | None = None
 ) -> Row:
     """Reconstruct one scene, and compare it with what became of the right one."""
-    error_mm, score, gap_px = None, _REFUSED_SCORE, ()
+    error_mm, score = None, _REFUSED_SCORE
+    gap_px: tuple[float, ...] = ()
     try:
         result = engine.reconstruct(list(told.images), case.scene(told))
     except GcarError as error:
@@ -222,6 +223,13 @@ def tables(rows: Sequence[Row]) -> str:
                 lines.append(
                     f"| {pictures} | {views} | {len(own)} | {_statuses(own)} | {share:.0%} |"
                 )
+    doubted = [r for r in rows if r.change == RIGHT and r.status != OK]
+    if doubted:
+        lines += ["", "| right, not `ok` | pictures | views | error mm | why |", "|---" * 5 + "|"]
+    lines += [
+        f"| {r.exam} | {r.pictures} | {r.views} | {_mm(r.error_mm)} | {r.sentence} |"
+        for r in doubted
+    ]
     return "\n".join([*lines, "", roc_table(rows)])
 
 

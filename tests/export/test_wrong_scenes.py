@@ -90,3 +90,18 @@ def test_tables_count_what_was_missed():
     text = tables(rows)
     assert "5 wrong scenes, 1 of them `ok`" in text and "| raw | 2 | 1 | 1 / 0 / 0 | 100% |" in text
     assert "3 visible wrong scenes against 1 right ones: area 1.000" in roc_table(rows)
+    assert "| right, not `ok` |" not in text
+    doubted = dataclasses.replace(rows[-1], status="degraded", sentence="because")
+    assert "| 1/0 left | raw | 2 | 0.50 | because |" in tables([*rows, doubted])
+
+
+def test_a_tree_that_explains_masks_as_well_shows_that_an_error_does_not():
+    seen = row("a", "ok", 0.9)
+    hidden = dataclasses.replace(seen, gap_px=(0.9, 1.2), right_gap_px=(0.8, 1.3))
+    assert seen.missed and seen.missed_plainly and hidden.missed and not hidden.missed_plainly
+    told = {"gap_px": (0.9, 1.6)}, {"gap_px": ()}, {"pictures": "path_length"}, {"shows": "anatomy"}
+    for how in told:  # worse in one picture, no tree, exact pictures, anatomy's to tell
+        assert dataclasses.replace(hidden, **how).missed_plainly
+    assert "2 of them `ok`" in tables([seen, hidden]) and "; 1 of them where" in tables(
+        [seen, hidden]
+    )
