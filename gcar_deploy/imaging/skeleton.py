@@ -14,12 +14,40 @@ _BLOCK = np.ones((3, 3), np.uint8)
 def skeletonize(mask: Mask) -> Mask:
     """Thin a (rows, cols) mask to lines one pixel wide; connected stays connected.
 
-    Guo and Hall's thinning. A border of one pixel is added first, since the filter leaves the
-    outermost pixels alone.
+    Parallel thinning of Guo and Hall (Communications of the ACM 32:359, 1989), what
+    ``cv2.ximgproc.thinning`` does too, which looks at the whole picture for every layer that goes.
+    Here a pixel is looked at again only where one beside it went.
     """
-    padded = cv2.copyMakeBorder(mask.astype(np.uint8) * 255, 2, 2, 2, 2, cv2.BORDER_CONSTANT)
-    thin = cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_GUOHALL)
-    return np.ascontiguousarray(thin[2:-2, 2:-2] > 0)
+    here = np.pad(mask, 1)
+    ring = np.array([-1, -1, 0, 1, 1, 1, 0, -1]) * here.shape[1]  # clockwise from above
+    ring += np.array([0, 1, 1, 1, 0, -1, -1, -1])
+    on = here.reshape(-1)
+    edge = cv2.erode(here.astype(np.uint8), _BLOCK, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    due = [np.flatnonzero(on & (edge.reshape(-1) == 0))] * 2
+    half = 0
+    while len(due[0]) or len(due[1]):
+        at, due[half] = due[half], due[half][:0]
+        around = (on[at[:, None] + ring] << np.arange(8)).sum(axis=1)
+        gone = at[_GOES[half][around]]
+        if len(gone):
+            on[gone] = False
+            beside = (gone[:, None] + ring).reshape(-1)
+            beside = beside[on[beside]]
+            due = [np.unique(np.concatenate([old[on[old]], beside])) for old in due]
+        half = 1 - half
+    return np.ascontiguousarray(here[1:-1, 1:-1])
+
+
+def _rules() -> tuple[Mask, Mask]:
+    """(256,) whether a pixel with such neighbours goes, in the first and second half of a step."""
+    p2, p3, p4, p5, p6, p7, p8, p9 = ((np.arange(256)[None] >> np.arange(8)[:, None]) & 1) > 0
+    parts = (~p2 & (p3 | p4), ~p4 & (p5 | p6), ~p6 & (p7 | p8), ~p8 & (p9 | p2))
+    one = sum(part.astype(int) for part in parts) == 1
+    pairs = ((p9, p2, p3, p4, p5, p6, p7, p8), (p2, p3, p4, p5, p6, p7, p8, p9))
+    least = np.minimum(*(sum((a | b).astype(int) for a, b in zip(p[::2], p[1::2], strict=True))
+                         for p in pairs))  # fmt: skip
+    goes = one & (least >= 2) & (least <= 3)
+    return goes & ~((p6 | p7 | ~p9) & p8), goes & ~((p2 | p3 | ~p5) & p4)
 
 
 def neighbours(skeleton: Mask) -> Array:
@@ -151,3 +179,6 @@ def _carried(values: Array, skeleton: Mask, label: Array) -> Array:
     table = np.zeros(int(label.max()) + 1, values.dtype)
     table[label[skeleton]] = values[skeleton]
     return table[label]
+
+
+_GOES = _rules()

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,3 +72,15 @@ def test_strong_parts_and_spread():
     distance, (carried,) = skel.spread(kept, (3 * ones,), 2.0)
     np.testing.assert_allclose(carried, 3.0, rtol=1e-4)
     assert abs(distance[30, 20] - 20) < 0.2
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_thinning_is_that_of_opencv(seed):
+    """The same rule, pixel by pixel of the whole picture."""
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.random(rng.integers(1, 70, 2)), (0, 0), rng.uniform(0.3, 4))
+    mask = noise > np.quantile(noise, rng.uniform(0.1, 0.9))
+    # The filter leaves the outermost pixels alone.
+    padded = cv2.copyMakeBorder(mask.astype(np.uint8) * 255, 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    thin = cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_GUOHALL)
+    np.testing.assert_array_equal(skel.skeletonize(mask), thin[2:-2, 2:-2] > 0)
