@@ -22,6 +22,8 @@ from gcar_deploy.errors import GcarError
 
 #: what a new process does beside the stages of the reconstruction, in order
 BEFORE, AFTER, WHOLE = ("imports", "model"), ("files",), "whole process"
+#: what no process of these libraries can do without, and the highest resident memory, MB
+LIBRARIES, PEAK = "import numpy, cv2, onnxruntime", "peak MB"
 #: a process that takes longer is ended
 _MOST_S = 600
 _CHILD = """
@@ -37,6 +39,11 @@ t.append(time.perf_counter())
 result.save(sys.argv[5])
 t.append(time.perf_counter())
 own = {"imports": t[1] - t[0], "model": t[2] - t[1], "files": t[4] - t[3]}
+try:
+    told = open("/proc/self/status").read()
+    own["peak MB"] = int(told.split("VmHWM:")[1].split()[0]) / 1024
+except (OSError, IndexError):
+    pass
 json.dump({**own, **result.seconds}, sys.stdout)
 """
 
@@ -55,7 +62,8 @@ def stage_seconds(
     Returns
     -------
     cold, warm : stage to median seconds; cold also ``imports``, ``model`` (load, check, golden
-        case), ``files`` (the result folder) and ``whole process`` (``gcar run``)
+        case of a model from elsewhere), ``files`` (the result folder), ``whole process``
+        (``gcar run``), beside it ``LIBRARIES``, and ``PEAK`` where the system tells it
 
     Raises
     ------
@@ -85,9 +93,14 @@ def table(cold: Mapping[str, float], warm: Mapping[str, float]) -> str:
     """Markdown of both, stages in their order."""
     stages = [name for name in warm if name != "total"]
     rows = ["| stage | cold s | warm s |", "|---|---|---|"]
-    for name in (*BEFORE, *stages, "total", *AFTER, WHOLE):
+    for name in (*BEFORE, *stages, "total", *AFTER, WHOLE, LIBRARIES):
         label = "pictures to tree" if name == "total" else name
-        rows.append(f"| {label} | {_cell(cold, name)} | {_cell(warm, name)} |")
+        if name in cold:
+            rows.append(f"| {label} | {_cell(cold, name)} | {_cell(warm, name)} |")
+    if LIBRARIES in cold:
+        rows.append(f"\nwhole process: {cold[WHOLE] / cold[LIBRARIES]:.1f} times these imports")
+    if PEAK in cold:
+        rows.append(f"\npeak resident memory: {cold[PEAK]:.0f} MB")
     return "\n".join(rows)
 
 
@@ -96,7 +109,7 @@ def _cell(seconds: Mapping[str, float], name: str) -> str:
 
 
 def _cold(threads: int | None) -> dict[str, float]:
-    """Run one process that tells its stages, and one ``gcar run`` that is timed from outside."""
+    """Run a process that tells its stages, ``gcar run`` and bare imports, timed from outside."""
     case = demo_case()
     inputs = [*(str(path) for path in case.pictures), str(case.geometry)]
     with tempfile.TemporaryDirectory(prefix="gcar-stages-") as folder:
@@ -105,9 +118,11 @@ def _cold(threads: int | None) -> dict[str, float]:
                "--out", str(Path(folder) / "b")]  # fmt: skip
         started = time.perf_counter()
         _process([*run, *(["--threads", str(threads)] if threads else [])])
-        whole = time.perf_counter() - started
+        ended = time.perf_counter()
+        _process(["-c", LIBRARIES])
+        bare = time.perf_counter() - ended
     seconds: dict[str, float] = json.loads(told)
-    return {**seconds, WHOLE: whole}
+    return {**seconds, WHOLE: ended - started, LIBRARIES: bare}
 
 
 def _process(arguments: list[str]) -> str:
