@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -38,10 +39,12 @@ class Branch:
     def __len__(self) -> int:
         return len(self.points_mm)
 
-    @property
+    @functools.cached_property
     def arc_mm(self) -> Scalars:
-        """(m,) distance from the first point along the centreline, mm."""
-        return polyline_arc(self.points_mm)
+        """(m,) distance from the first point along the centreline, mm; read only."""
+        arc = polyline_arc(self.points_mm)
+        arc.setflags(write=False)
+        return arc
 
     @property
     def length_mm(self) -> float:
