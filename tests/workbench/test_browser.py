@@ -77,6 +77,10 @@ def test_demo_to_result_to_deletion_and_back(serve, browse, engine, tmp_path):
     rows = page.locator("#lesions tbody tr")
     before, first = rows.count(), files_of(case / "result")
     assert before > 5 and "deleted_mm" not in order_of(case)
+    told = json.loads((case / "result" / "result.json").read_text())["tree"]["branches"]
+    ends = [f"{b['proximal_reference_mm']:.2f}, {b['distal_reference_mm']:.2f}" for b in told
+            if b["proximal_reference_mm"] is not None]  # fmt: skip
+    assert ends and sorted(page.locator("#lesions .ends").all_inner_texts()) == sorted(ends)
     page.click('button[aria-label="Delete branch 5"]')
     until(page, lambda: rows.count() < before)
     finished(page)

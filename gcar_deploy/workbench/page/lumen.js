@@ -3,10 +3,14 @@ import { $, colorOf, el, inside, nameOf, pen, ring } from "./dom.js";
 
 const fixed = (value, digits) => value === null || value === undefined ? "\u2013" : value.toFixed(digits);
 const COLUMNS = [
-  ["Vessel", ""], ["Stenosis", "% diameter"], ["", "% area"], ["Least", "mm"], ["Reference", "mm"],
+  ["Vessel", ""], ["Stenosis", "% diameter"], ["", "% area"], ["Least", "mm"], ["Reference", "mm (proximal, distal)"],
   ["Lesion", "mm"], ["From ostium", "mm"], ["Length", "mm"], ["Ghost", "%"], ["", ""],
 ];
 export const area = percent => percent === null ? null : 100 * (1 - (1 - percent / 100) ** 2);
+
+/** Healthy diameter at the narrowing, and at both borders of the lesion where there is one. */
+const reference = row => [fixed(row.reference_diameter_mm, 2),
+  (row.proximal_reference_mm ?? null) === null ? "" : el("small", { class: "ends" }, `${fixed(row.proximal_reference_mm, 2)}, ${fixed(row.distal_reference_mm, 2)}`)];
 
 /** Fill the table, the most severe narrowing first; erase is called with a branch to delete. */
 export function table(store, erase) {
@@ -14,7 +18,7 @@ export function table(store, erase) {
   const rows = branches.map(branch => {
     const { row } = branch, percent = row.stenosis_percent;
     const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
-      fixed(row.minimal_diameter_mm, 2), fixed(row.reference_diameter_mm, 2), fixed(row.lesion_length_mm, 1),
+      fixed(row.minimal_diameter_mm, 2), reference(row), fixed(row.lesion_length_mm, 1),
       row.minimal_at_mm === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
       row.ghost_probability === null ? "\u2013" : `${Math.round(100 * row.ghost_probability)}`];
     const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
@@ -23,7 +27,7 @@ export function table(store, erase) {
     jump.querySelector(".swatch").style.background = colorOf(branch.branch);
     const drop = el("button", { type: "button", class: "small", "aria-label": `Delete branch ${branch.branch}`, title: "Delete this branch (Delete)", onclick: e => { e.stopPropagation(); erase(branch); } }, "Delete");
     return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : "", onclick: () => jumpTo(store, branch) },
-      el("td", {}, jump), ...cells.map(text => el("td", {}, text)), el("td", {}, drop));
+      el("td", {}, jump), ...cells.map(content => el("td", {}, content)), el("td", {}, drop));
   });
   $("lesions").replaceChildren(
     el("thead", {}, el("tr", {}, ...COLUMNS.map(([name, unit], k) => el("th", { scope: "col" }, name || (k === 9 ? el("span", { class: "swatch", hidden: true }) : "\u00a0"), el("small", {}, unit))))),
