@@ -116,6 +116,6 @@ def flow_table(count: int, percent: float, fit: bool) -> None:
     with click.progressbar(length=count, label="trees", file=sys.stderr) as bar:
         rows, errors = flow.flow_rows(count, percent, fit, lambda: bar.update(1))
     if fit:
-        floor, share, narrow, lost = flow.fitted(errors)
-        click.echo(f"FLOOR_MM {floor:.3f}, SHARE {share:.3f}, NARROW {narrow:.3f}, LOST {lost:.3f}")
+        floor, share, lost = flow.fitted(errors)
+        click.echo(f"FLOOR_MM {floor:.3f}, SHARE {share:.3f}, LOST {lost:.3f}")
     click.echo(flow.table(rows))

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.flow import Assumption, PressureDrop, model_0d, pressure_drop
-from gcar_deploy.measure.lumen import branch_lumen
+from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.tree.tree import Tree
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
@@ -127,7 +127,7 @@ def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
 
 def told(tree: Tree, assumed: Assumption) -> PressureDrop:
     """Pressure drop of a tree."""
-    return pressure_drop(tree, [branch_lumen(b) for b in tree.branches], assumed)
+    return pressure_drop(tree, tree_lumens(tree), assumed)
 
 
 def diameters(case: StenosisCase, tree: Tree) -> DiameterError:
@@ -141,14 +141,14 @@ def diameters(case: StenosisCase, tree: Tree) -> DiameterError:
         g <= 0.5 * NEAR_MM and len(set(own[near])) == 1
         for g, near in zip(gap, lookup.query_ball_point(tree.points(), CLEAR_MM), strict=True)
     ])  # fmt: skip
-    healthy = np.concatenate([branch_lumen(b).healthy_mm for b in tree.branches])
+    healthy = np.concatenate([lumen.healthy_mm for lumen in tree_lumens(tree)])
     return DiameterError(
         true_mm=2 * radii[at][clear], found_mm=2 * tree.radii()[clear], healthy_mm=healthy[clear]
     )
 
 
-def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float, float]:
-    """Constants of ``flow.spread`` that make the errors likeliest: floor, share, narrow, lost."""
+def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float]:
+    """Constants of ``flow.spread`` that make the errors likeliest: floor, share, lost."""
     true, found, healthy = (
         np.concatenate([getattr(e, name) for e in errors])
         for name in ("true_mm", "found_mm", "healthy_mm")
@@ -156,15 +156,15 @@ def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float, float]
     narrow = np.maximum(np.nan_to_num(healthy - found), 0.0)
 
     def cost(log: np.ndarray) -> float:
-        floor, share, narrowing, lost = np.exp(log)
-        variance = floor**2 + (share * found) ** 2 + (narrowing * narrow) ** 2
+        floor, share, lost = np.exp(log)
+        variance = floor**2 + (share * found) ** 2
         return float(
             np.mean(0.5 * np.log(variance) + 0.5 * (found - lost * narrow - true) ** 2 / variance)
         )
 
-    best = minimize(cost, np.log([0.1, 0.05, 0.1, 0.05]), method="Nelder-Mead")
-    floor, share, narrowing, lost = np.exp(best.x).tolist()
-    return floor, share, narrowing, lost
+    best = minimize(cost, np.log([0.1, 0.05, 0.05]), method="Nelder-Mead")
+    floor, share, lost = np.exp(best.x).tolist()
+    return floor, share, lost
 
 
 def solver_gap(tree: Tree, drop: PressureDrop) -> float:

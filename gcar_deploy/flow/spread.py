@@ -1,15 +1,14 @@
 """How far diameters may be off, and trees drawn with such errors.
 
-The standard deviation of a diameter grows with the diameter and with how narrow the vessel is
-against its healthy width, and on average a narrow core comes out too wide, since it is smoothed
-over:
+The standard deviation of a diameter grows with the diameter, and on average a narrow core comes
+out too wide, since it is smoothed over:
 
-    sigma^2 = FLOOR^2 + (SHARE d)^2 + (NARROW n)^2,  mean = d - LOST n,  n = healthy - d.
+    sigma^2 = FLOOR^2 + (SHARE d)^2,  mean = d - LOST n,  n = healthy - d.
 
 Errors along a vessel go together. A part is common to a branch (calibration, threshold), the rest
-changes over ``REACH_MM``. The constants were chosen by hand, for coverage on generated trees (seeds
-apart from those that are reported), beside what ``gcar-export flow-table --fit`` finds most likely;
-they belong to the present fit of the lumen.
+changes over ``REACH_MM``. The first three are what ``gcar-export flow-table --fit`` finds most
+likely on generated trees (apart from those that are reported); they belong to the present fit of
+the lumen.
 """
 
 from __future__ import annotations
@@ -23,19 +22,16 @@ from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
-FLOOR_MM, SHARE, NARROW, LOST = 0.12, 0.04, 0.12, 0.1
+FLOOR_MM, SHARE, LOST = 0.136, 0.047, 0.081
 #: share of the variance that is common to a branch, and how far the rest reaches along it, mm
 COMMON, REACH_MM = 0.3, 4.0
 #: a diameter is known to a factor of this at worst; a wider spread says nothing more
 _MOST_LOG = 0.5
 
 
-def diameter_sigma_mm(branch: Branch, lumen: BranchLumen) -> Scalars:
+def diameter_sigma_mm(branch: Branch) -> Scalars:
     """(m,) standard deviation of the diameter at each point of a branch, mm."""
-    d = 2.0 * branch.radius_mm
-    out: Scalars = np.sqrt(
-        FLOOR_MM**2 + (SHARE * d) ** 2 + (NARROW * narrowing_mm(branch, lumen)) ** 2
-    )
+    out: Scalars = np.sqrt(FLOOR_MM**2 + (SHARE * 2.0 * branch.radius_mm) ** 2)
     return out
 
 
@@ -71,7 +67,7 @@ def draw(
     samples : how many
     """
     pairs = list(zip(tree.branches, lumens, strict=True))
-    sigma_mm = np.concatenate([diameter_sigma_mm(*pair) for pair in pairs])
+    sigma_mm = np.concatenate([diameter_sigma_mm(branch) for branch in tree.branches])
     lost = LOST * np.concatenate([narrowing_mm(*pair) for pair in pairs])
     owner = tree.branch_index()
     n = len(tree.branches)

@@ -103,12 +103,6 @@ def tree_lumens(
     )
 
 
-def branch_lumen(branch: Branch) -> BranchLumen:
-    """Measure one branch by its own radii, without what the rest of its tree tells of it."""
-    alone = dataclasses.replace(branch, start=0, end=1)
-    return tree_lumens(Tree(nodes_mm=branch.points_mm[[0, -1]], branches=(alone,)))[0]
-
-
 def _clear(tree: Tree, k: int, own: Sections) -> Array:
     """(m,) sections away from both ends, where the vessel ends or opens into another."""
     branch, arc, radius = tree.branches[k], own.arc_mm, 0.5 * own.diameter_mm

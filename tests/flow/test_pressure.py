@@ -12,7 +12,7 @@ from gcar_deploy.flow import Assumption, doubts_of, pressure_drop, pressure_tabl
 from gcar_deploy.flow.assumption import M3_S_PER_ML_MIN
 from gcar_deploy.flow.spread import diameter_sigma_mm, draw
 from gcar_deploy.measure import from_inlets
-from gcar_deploy.measure.lumen import branch_lumen
+from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.tree.tree import Tree
 from tests.flow.trees import MMHG, MU, RHO, drop_of, stenosed, stenosed_fork, straight
 from tests.measure.test_naming import left_tree
@@ -81,7 +81,7 @@ def test_a_value_is_withheld_where_its_interval_is_wide_and_given_where_it_is_no
 
 def test_a_degraded_result_tells_nothing():
     tree = stenosed_fork(0.0)
-    lumens = [branch_lumen(b) for b in tree.branches]
+    lumens = tree_lumens(tree)
     for vessel in pressure_drop(tree, lumens, doubts=doubts_of("degraded", "Why.", 3)).vessels:
         assert vessel.withheld == "the result is degraded: Why." and not vessel.told.any()
     assert doubts_of("ok", "Fine.", 3) == {}
@@ -90,7 +90,7 @@ def test_a_degraded_result_tells_nothing():
 
 def test_a_doubt_goes_downstream_and_not_beside():
     tree = stenosed_fork(0.0)
-    lumens = [branch_lumen(b) for b in tree.branches]
+    lumens = tree_lumens(tree)
     of_trunk = pressure_drop(tree, lumens, doubts={0: "seen in one view alone"}).vessels
     assert of_trunk[1].withheld == "branch 1 before it: seen in one view alone"
     of_daughter = pressure_drop(tree, lumens, doubts={1: "seen in one view alone"}).vessels
@@ -102,7 +102,7 @@ def test_what_is_not_joined_to_an_artery_or_lies_behind_a_loop_is_left_out():
     far = points + np.array([0, 50, 0])
     two = Tree(nodes_mm=np.stack([points[0], points[-1], far[0], far[-1]]),
                branches=(branch(points, 1.5), branch(far, 1.4, 2, 3)))  # fmt: skip
-    lumens = [branch_lumen(b) for b in two.branches]
+    lumens = tree_lumens(two)
     plain = pressure_drop(two, lumens)
     assert "not joined" in plain.vessels[1].withheld and np.isnan(plain.vessels[1].ratio).all()
     assert not pressure_drop(two, lumens, names=["LAD", "RCA"]).vessels[1].withheld
@@ -134,8 +134,8 @@ def test_either_cause_alone_is_narrower_than_both():
 def test_draws_have_the_stated_sigma():
     tree = stenosed(50.0, count=61)
     own = tree.branches[0]
-    lumen = branch_lumen(own)
-    sigma = diameter_sigma_mm(own, lumen)
+    (lumen,) = tree_lumens(tree)
+    sigma = diameter_sigma_mm(own)
     drawn = draw(tree, [lumen], 4000, np.random.default_rng(0)).points
     np.testing.assert_allclose(drawn.std(axis=0), sigma / (2 * tree.radii()), rtol=0.08)
     # Narrow cores come out too wide: what may be there is narrower.
@@ -150,7 +150,7 @@ def test_intervals_hold_the_truth_nine_times_in_ten():
     for k in range(100):
         seen = stenosed(rng.uniform(20, 55), rng.uniform(1.3, 1.9), count=81)
         own = seen.branches[0]
-        off = draw(seen, [branch_lumen(own)], 1, np.random.default_rng(1000 + k)).points[0]
+        off = draw(seen, tree_lumens(seen), 1, np.random.default_rng(1000 + k)).points[0]
         true = dataclasses.replace(own, radius_mm=own.radius_mm * np.exp(off))
         found = drop_of(seen, **known).vessels[0]
         truth = drop_of(dataclasses.replace(seen, branches=(true,)), **known).vessels[0].ratio[-1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.flow import pressure_drop
-from gcar_deploy.measure.lumen import branch_lumen
+from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.tree.tree import Branch, Tree
 from tests.tree.shapes import branch, fork
 
@@ -19,7 +19,7 @@ MU, RHO, MMHG = 0.0035, 1060.0, 133.322
 def drop_of(tree, **assumed):
     from gcar_deploy.flow import Assumption
 
-    return pressure_drop(tree, [branch_lumen(b) for b in tree.branches], Assumption(**assumed))
+    return pressure_drop(tree, tree_lumens(tree), Assumption(**assumed))
 
 
 def straight(radius_mm, length_mm=60.0):
