@@ -90,7 +90,7 @@ def test_every_number_has_its_range_and_every_default_lies_in_it():
         ("refine.tube.steps", (3, -1), "refine.tube.steps = -1 must be a whole number, 0 .. "),
         ("pose.enabled", 1, "pose.enabled = 1 must be True or False"),
         ("predict", None, "predict = None must be PredictOptions"),
-        ("predict.predictor", 7, "predictor = 7 must be one of auto, multi, single, none"),
+        ("predict.predictor", 7, "predictor = 7 must be one of auto, multi, paper, none"),
         ("imaging.segmenter", "Net", "segmenter = 'Net' must be one of auto, classic, net"),
     ],
 )

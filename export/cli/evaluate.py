@@ -154,7 +154,7 @@ def evaluate(
 @click.command()
 @click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
 @_PROTOCOL
-@click.option("--methods", default="nerp,fbp+paper", show_default=True, help="Comma-separated.")
+@click.option("--methods", default="nerp,3dgr-fbp", show_default=True, help="Comma-separated.")
 @click.option("--steps", default="25,50,100,200,400", show_default=True, help="Budgets.")
 @click.option("--views", default=2, show_default=True, help="2 .. 16")
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
@@ -197,6 +197,42 @@ def converge(
         progress.close()
     click.echo(convergence.table(rows))
     click.echo(out / "converge.png")
+
+
+@click.command("paper-page")
+@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/ and asoca/.")
+@click.option("--out", type=_OUT, required=True, help="Rows, paper.md, paper-views.png.")
+@click.option("--paper-steps", type=int, help="Most iterations; the printed 8,000 without.")
+@click.option("--cases", default="", help="Only these cases, comma-separated.")
+@click.option("--jobs", default=1, show_default=True, help="Processes on this machine.")
+@click.option("--draw-only", is_flag=True, help="Run nothing; draw what is there.")
+@click.option("--quiet", is_flag=True, help="No progress on stderr.")
+def paper_page(
+    data: Path, out: Path, paper_steps: int | None, cases: str, jobs: int, draw_only: bool,
+    quiet: bool,
+) -> None:  # fmt: skip
+    """Print the paper's tables and draw its figures, in its layout, beside its printed values.
+
+    Takes hours on two cores. Goes on where an earlier run with the same --out stopped.
+
+    Example: gcar-export paper-page --data data --out paper --paper-steps 600
+    """
+    from gcar_export.studies import paper_page as study
+
+    if not draw_only:
+        progress = _Progress(quiet=quiet)
+        try:
+            study.run(
+                data, out, paper_steps=paper_steps, cases=words(cases), jobs=jobs,
+                progress=progress,
+            )  # fmt: skip
+        finally:
+            progress.close()
+    rows = study.read_rows(out)
+    text = study.page(rows)
+    (out / "paper.md").write_text(text + "\n", encoding="utf-8")
+    click.echo(text)
+    click.echo(study.draw(rows, out))
 
 
 def words(text: str) -> tuple[str, ...]:

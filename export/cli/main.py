@@ -12,7 +12,7 @@ import click
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli.centers import centers_table, robustness
-from gcar_export.cli.evaluate import converge, evaluate
+from gcar_export.cli.evaluate import converge, evaluate, paper_page
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table
 from gcar_export.cli.wrong_scenes import wrong_scenes
@@ -122,7 +122,7 @@ def pair_time(label: Path, repeats: int) -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
 @click.option(
     "--network",
-    type=click.Choice(["multi", "single"]),
+    type=click.Choice(["multi", "paper"]),
     default="multi",
     show_default=True,
     help="The predictor that sees all views, or the paper's that sees one.",
@@ -161,7 +161,7 @@ def train(
 ) -> None:
     """Train a predictor on generated trees; stop and go on at will.
 
-    Example: gcar-export train --network single --out runs/a --minutes 60
+    Example: gcar-export train --network paper --out runs/a --minutes 60
     """
     from gcar_export.training.train import start
 
@@ -296,6 +296,7 @@ def lumen_table(data: Path | None, count: int, vessels: int, healthy: int) -> No
 for _verb in (
     evaluate,
     converge,
+    paper_page,
     centers_table,
     robustness,
     refine_table,

@@ -30,13 +30,21 @@ PRINTED: Mapping[tuple[str, str], tuple[tuple[float, float], ...]] = {
 }  # fmt: skip
 #: rows of each of the paper's tables: our method -> the paper's name for it, or None.
 TABLE_1: Mapping[str, str | None] = {
-    "fdk": "FBP", "sart": None, "visual_hull": None, "nerp": "NeRP", "single+paper": "3DGR-GCP",
-    "hull+tube": None, "multi": None, "ours": None,
+    "fdk": "FBP", "sart": None, "visual_hull": None, "nerp": "NeRP", "3dgr-gcp": "3DGR-GCP",
+    "ours": None,
 }  # fmt: skip
 TABLE_2: Mapping[str, str | None] = {
-    "fbp+paper": "3DGR-FBP", "single+paper": "3DGR-GCP",
-    "single+paper-noloss": "3DGR-GCP, L2 alone", "hull+paper": None, "multi+paper": None,
-    "ours": None,
+    "3dgr-fbp": "3DGR-FBP", "3dgr-fbp-l2": None, "3dgr-gcp-l2": "3DGR-GCP, L2 alone",
+    "3dgr-gcp": "3DGR-GCP", "3dgr-gcp-short": None, "ours": None,
+}  # fmt: skip
+
+
+#: what the rows are called in these tables
+NAMES: Mapping[str, str] = {
+    "fdk": "FBP (FDK)", "nerp": "NeRP, fitted on hull voxels", "ours": "gcar as it comes",
+    "3dgr-gcp": "3DGR-GCP (as printed)", "3dgr-gcp-l2": "3DGR-GCP (as printed), L2 alone",
+    "3dgr-fbp": "3DGR-FBP (as printed)", "3dgr-fbp-l2": "3DGR-FBP (as printed), L2 alone",
+    "3dgr-gcp-short": "3DGR-GCP, short budget",
 }  # fmt: skip
 
 
@@ -72,7 +80,7 @@ def _table(
                     mean_sd(entry[c], MEASURES[c], entry["cases"]) + stars.get((method, c), "")
                     for c in COLUMNS
                 ]
-                out.append("| " + " | ".join([name, method, *cells]) + " |")
+                out.append("| " + " | ".join([name, NAMES.get(method, method), *cells]) + " |")
             if method in found and printed is not None and (dataset, printed) in PRINTED:
                 cells = [f"{m:.2f} ± {s:.2f}" for m, s in PRINTED[dataset, printed]]
                 out.append("| " + " | ".join([dataset, f"*{printed}, {NOTE}*", *cells]) + " |")

@@ -10,7 +10,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.config import PaperOptions, PredictorName, RefinerName, RunOptions, SegmenterName
+from gcar_deploy.config import (
+    PRINTED,
+    RELEASED,
+    Backend,
+    PaperOptions,
+    PredictorName,
+    RefinerName,
+    RunOptions,
+    SegmenterName,
+)
 from gcar_deploy.errors import UsageError
 from gcar_export.methods.fdk import FdkOptions
 from gcar_export.methods.nerp import NerpOptions
@@ -25,6 +34,7 @@ class RuntimeRow:
     Attributes
     ----------
     predictor, refiner : of ``RunOptions``; None for what the runtime does unasked
+    printed : the paper's refinement as printed (``config.PRINTED``) in place of a short budget
     centreline_loss : False turns the paper's centreline term off (alpha = 1)
     swapped : the views are given in the other order
     pose : False leaves the views where the scene puts them
@@ -37,6 +47,7 @@ class RuntimeRow:
 
     predictor: PredictorName | None = None
     refiner: RefinerName | None = None
+    printed: bool = False
     centreline_loss: bool = True
     swapped: bool = False
     pose: bool = True
@@ -62,21 +73,25 @@ RUNTIME_ROWS: Mapping[str, RuntimeRow] = {
     "hull": RuntimeRow(predictor="none", refiner="none"),
     "hull+paper": RuntimeRow(predictor="none", refiner="paper"),
     "hull+tube": RuntimeRow(predictor="none", refiner="tube"),
-    "single": RuntimeRow(predictor="single", refiner="none"),
-    "single+paper": RuntimeRow(predictor="single", refiner="paper"),
-    "single+paper-noloss": RuntimeRow(
-        predictor="single", refiner="paper", centreline_loss=False
+    "3dgr-gcp": RuntimeRow(predictor="paper", refiner="paper", printed=True),
+    "3dgr-gcp-l2": RuntimeRow(
+        predictor="paper", refiner="paper", printed=True, centreline_loss=False
     ),
-    "single+tube": RuntimeRow(predictor="single", refiner="tube"),
+    "3dgr-gcp-short": RuntimeRow(predictor="paper", refiner="paper"),
     "multi": RuntimeRow(predictor="multi", refiner="none"),
     "multi+paper": RuntimeRow(predictor="multi", refiner="paper"),
     "multi+tube": RuntimeRow(predictor="multi", refiner="tube"),
 }  # fmt: skip
 #: rows that know nothing of the runtime but its geometry.
 BASELINES = ("fdk", "sart", "visual_hull", "nerp")
-#: the paper's refinement from an FBP start ("3DGR-FBP").
-FBP_PAPER = "fbp+paper"
-METHODS = (*RUNTIME_ROWS, FBP_PAPER, *BASELINES)
+#: the paper's refinement from an FBP start ("3DGR-FBP"); how each row differs from as printed.
+FBP_ROWS: Mapping[str, PaperOptions] = {
+    "3dgr-fbp": PRINTED,
+    "3dgr-fbp-l2": dataclasses.replace(PRINTED, alpha=1.0),
+    "3dgr-fbp-released": RELEASED,
+    "3dgr-fbp-short": dataclasses.replace(PRINTED, steps=PaperOptions().steps),
+}
+METHODS = (*RUNTIME_ROWS, *FBP_ROWS, *BASELINES)
 #: options of the runtime that a simulated case depends on (not: how files are read).
 _STAGES = (
     "imaging", "pose", "candidates", "predict", "refine", "quality",
@@ -93,16 +108,18 @@ DESCRIPTIONS: Mapping[str, str] = {
     "ours-classic": "the same, vessels of raw pictures found without the network",
     "ours-net": "the same, vessels of raw pictures found by the network alone",
     "hull": "hull thinned: no model, no refinement",
-    "hull+paper": "hull thinned, the paper's refinement",
+    "hull+paper": "hull thinned, the paper's refinement, short budget",
     "hull+tube": "hull thinned, tube refinement",
-    "single": "single-view predictor alone",
-    "single+paper": "the paper's method (3DGR-GCP): single-view predictor, its refinement",
-    "single+paper-noloss": "the same without the centreline loss",
-    "single+tube": "single-view predictor, tube refinement",
+    "3dgr-gcp": "3DGR-GCP (as printed): the paper's predictor, its refinement",
+    "3dgr-gcp-l2": "3DGR-GCP (as printed), L2 alone",
+    "3dgr-gcp-short": "3DGR-GCP, short budget (150 iterations)",
     "multi": "multi-view predictor alone",
-    "multi+paper": "multi-view predictor, the paper's refinement",
+    "multi+paper": "multi-view predictor, the paper's refinement, short budget",
     "multi+tube": "multi-view predictor, tube refinement (what gcar does)",
-    FBP_PAPER: "3DGR-FBP: FDK start, the paper's refinement",
+    "3dgr-fbp": "3DGR-FBP (as printed): FDK start, the paper's refinement",
+    "3dgr-fbp-l2": "3DGR-FBP (as printed), L2 alone",
+    "3dgr-fbp-released": "3DGR-FBP with the settings of the released code",
+    "3dgr-fbp-short": "3DGR-FBP, short budget (150 iterations)",
     "fdk": "filtered backprojection (FDK, itk-rtk)",
     "sart": "SART, non-negative (itk-rtk)",
     "visual_hull": "visual hull",
@@ -118,10 +135,10 @@ class MethodSettings:
     ----------
     fdk, sart, nerp : of the baselines of these names
     hull_path_mm : a pixel is vessel for ``visual_hull`` from this path length on
-    fbp_gaussians : Gaussians that ``fbp+paper`` starts with (the paper's number)
-    fbp_steps : steps of ``fbp+paper``: a reduced budget, for two cores
-    paper_steps : steps of the paper's refinement in all rows that use it; None for the
-        defaults (``PaperOptions.steps``, ``fbp_steps``)
+    fbp_gaussians : Gaussians that 3DGR-FBP starts with (the released code's number)
+    paper_steps : most steps of the paper's refinement in all rows that use it; None for those of
+        the row
+    backend : what projects Gaussians in these rows; numba is ten times as fast as NumPy
     run : the runtime's options
     """
 
@@ -130,8 +147,8 @@ class MethodSettings:
     nerp: NerpOptions = dataclasses.field(default_factory=NerpOptions)
     hull_path_mm: float = PATH_THRESHOLD_MM
     fbp_gaussians: int = 10_000
-    fbp_steps: int = 150
     paper_steps: int | None = None
+    backend: Backend = "numba"
     run: RunOptions = dataclasses.field(default_factory=RunOptions)
 
     def __post_init__(self) -> None:
@@ -141,9 +158,7 @@ class MethodSettings:
     def run_options(self, method: str) -> RunOptions:
         """Return the runtime's options for a method of ``RUNTIME_ROWS``."""
         row, run = RUNTIME_ROWS[method], self.run
-        paper = run.refine.paper
-        if self.paper_steps is not None:
-            paper = dataclasses.replace(paper, steps=self.paper_steps)
+        paper = self._limited(PRINTED if row.printed else run.refine.paper)
         if not row.centreline_loss:
             paper = dataclasses.replace(paper, alpha=1.0)
         return dataclasses.replace(
@@ -166,15 +181,13 @@ class MethodSettings:
             ),
         )
 
-    def fbp_paper_options(self) -> PaperOptions:
-        """Return the paper's refinement from an FBP start: all its points, weak ones too."""
-        return dataclasses.replace(
-            self.run.refine.paper,
-            steps=self.paper_steps or self.fbp_steps,
-            most_gaussians=max(self.run.refine.paper.most_gaussians, self.fbp_gaussians),
-            least_confidence=0.0,
-            thin_cells=0.0,
-        )
+    def fbp_paper_options(self, method: str) -> PaperOptions:
+        """Return the paper's refinement from an FBP start, for a method of ``FBP_ROWS``."""
+        return self._limited(FBP_ROWS[method])
+
+    def _limited(self, paper: PaperOptions) -> PaperOptions:
+        steps = min(paper.steps, self.paper_steps or paper.steps)
+        return dataclasses.replace(paper, steps=steps, backend=self.backend)
 
     def of(self, method: str) -> dict[str, Any]:
         """Everything that the result of ``method`` depends on, as plain values."""
@@ -186,11 +199,11 @@ class MethodSettings:
                 "grey_masks": RUNTIME_ROWS[method].grey_masks,
                 "models": _model_hashes(options.predict.predictor),
             }
-        elif method == FBP_PAPER:
+        elif method in FBP_ROWS:
             out = {
                 "fdk": dataclasses.asdict(self.fdk),
                 "gaussians": self.fbp_gaussians,
-                "paper": dataclasses.asdict(self.fbp_paper_options()),
+                "paper": dataclasses.asdict(self.fbp_paper_options(method)),
             }
         elif method == "visual_hull":
             out = {"path_mm": self.hull_path_mm}

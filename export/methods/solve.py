@@ -21,7 +21,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Image, Points, Volume
 from gcar_export.methods.settings import (
-    FBP_PAPER,
+    FBP_ROWS,
     METHODS,
     RUNTIME_ROWS,
     MethodSettings,
@@ -76,8 +76,8 @@ def solve(case: Case, method: str, settings: MethodSettings | None = None) -> So
             return _runtime(case, options, RUNTIME_ROWS[method])
         _warm_up(method)
         clock = _Clock()
-        if method == FBP_PAPER:
-            volume, gaussians, sentence = _fbp_paper(case, settings)
+        if method in FBP_ROWS:
+            volume, gaussians, sentence = _fbp_paper(case, method, settings)
         else:
             volume, gaussians, sentence = _baseline(case, method, settings), None, ""
         return Solved(
@@ -264,7 +264,7 @@ def _baseline(case: Case, method: str, settings: MethodSettings) -> Volume:
     return fdk(*given, settings.fdk)
 
 
-def _fbp_paper(case: Case, settings: MethodSettings) -> tuple[Volume, int, str]:
+def _fbp_paper(case: Case, method: str, settings: MethodSettings) -> tuple[Volume, int, str]:
     from gcar_deploy.gaussians.paper import refine_paper
     from gcar_deploy.gaussians.voxelize import voxelize
     from gcar_deploy.imaging.extract import extract_vessels
@@ -275,7 +275,7 @@ def _fbp_paper(case: Case, settings: MethodSettings) -> tuple[Volume, int, str]:
     start = fdk(*given, case.grid, settings.fdk)
     centers = fbp_centers(start, case.grid, *given, settings.fbp_gaussians)
     views = [extract_vessels(a, settings.run.imaging) for a in case.angiograms()]
-    options = settings.fbp_paper_options()
+    options = settings.fbp_paper_options(method)
     fit = refine_paper(centers, views, options)
     volume = np.clip(voxelize(fit.gaussians, case.grid), 0.0, 1.0)
     return volume, len(fit.gaussians), f"{fit.steps} of at most {options.steps} steps"

@@ -22,7 +22,7 @@ from gcar_deploy.predict.encoding import (
     flat_inputs,
     input_names,
 )
-from gcar_export.scenes.gantry import USUAL_SPREAD_DEG, USUAL_VIEWS
+from gcar_export.scenes.gantry import PAPER_VIEWS, USUAL_SPREAD_DEG, USUAL_VIEWS
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.training.dataset import PATH_CELLS, training_scene
 from gcar_export.training.examinations import FINE_CELLS_MM, PAPER_CELLS_MM
@@ -169,21 +169,24 @@ def _spec(
             "geometry": "2 views or more, 25 .. 155 deg apart",
         }
     config = net.config
-    usual = ", ".join(_view_name(a, b) for a, b in USUAL_VIEWS)
+    usual = manifest["options"]["usual"]
+    names = ", ".join(_view_name(a, b) for a, b in USUAL_VIEWS)
     return spec | {
-        "kind": "single",
+        "kind": "paper",
         "inputs": {
             "pixels": config.pixels,
             "alpha": config.alpha,
             "pose": config.pose,
+            "directions_deg": [] if usual else [list(view) for view in PAPER_VIEWS],
             "depth_pixels": DEPTH_PIXELS,
             "offset_pixels": OFFSET_PIXELS,
             "max_path_pixels": MAX_PATH_PIXELS,
         },
         "outputs": ["depth 0 .. 1 along the true ray", "offset_pixels u v w"],
         "spacing_mm": [0.8, 1.6],
-        "geometry": f"the paper's two views; {usual}, give or take {USUAL_SPREAD_DEG:g} deg, "
-        "SOD 700 .. 820 mm",
+        "geometry": f"{names}, give or take {USUAL_SPREAD_DEG:g} deg, SOD 700 .. 820 mm"
+        if usual
+        else "the paper's two views, a cube of 180 mm seen from 1406 mm",
     }
 
 

@@ -38,7 +38,7 @@ def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
         shape = (1, int(model.inputs["channels"]), 64, 64)
         noise = np.random.default_rng(0).normal(size=shape)
         return {"channels": np.clip(noise, -1, 2).astype(np.float32)}
-    if model.kind == "single":
+    if model.kind == "paper":
         picture = net_picture(*views[0], int(model.inputs["pixels"]))
         arrays = [picture.network_input(), picture.axes_input()]
         return dict(zip(["picture", "axes"][: 1 + model.inputs["pose"]], arrays, strict=False))

@@ -25,7 +25,7 @@ from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.task_check import task_measure, torch_predictor
 from gcar_export.training.dataset import training_scene
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
-from gcar_export.training.single_dataset import training_pictures
+from gcar_export.training.paper_dataset import training_pictures
 
 #: largest difference between torch and ONNX Runtime, as a share of the output's range
 PARITY = 1e-4

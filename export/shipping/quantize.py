@@ -21,7 +21,7 @@ from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.task_check import task_measure
 from gcar_export.training.dataset import training_scene
 from gcar_export.training.networks.unet import UNetConfig
-from gcar_export.training.single_dataset import training_pictures
+from gcar_export.training.paper_dataset import training_pictures
 
 #: largest loss of the task measure, as a share of it
 MOST_LOST = 0.01

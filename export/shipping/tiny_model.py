@@ -1,7 +1,7 @@
 """Make the test models: one of each kind with a few hundred weights, from a seed.
 
 ``python -m gcar_export.shipping.tiny_model tests/data`` writes ``tiny.onnx`` and
-``tiny-single.onnx`` with their specs and golden cases, through the same export as real
+``tiny-paper.onnx`` with their specs and golden cases, through the same export as real
 checkpoints, so tests exercise the true ONNX path in milliseconds.
 """
 
@@ -22,13 +22,13 @@ from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 
 TINY = SparseConfig(width=(3, 2, 2, 2), stages=1, ray_width=1)
-TINY_SINGLE = UNetConfig(pixels=32, alpha=4, width=(4, 4), pose=True)
+TINY_PAPER = UNetConfig(pixels=64, alpha=2, width=(4, 4), pose=True)
 
 
 def write_tiny_checkpoint(folder: Path, seed: int = 0, network: str = "sparse") -> Path:
     """Write an untrained checkpoint of a network with its manifest; returns its path."""
     torch.manual_seed(seed)
-    net = SparsePredictor(TINY) if network == "sparse" else UNetPredictor(TINY_SINGLE)
+    net = SparsePredictor(TINY) if network == "sparse" else UNetPredictor(TINY_PAPER)
     save_file(
         {f"net.{k}": v.contiguous() for k, v in net.state_dict().items()},
         folder / "checkpoint.safetensors",
@@ -39,6 +39,7 @@ def write_tiny_checkpoint(folder: Path, seed: int = 0, network: str = "sparse") 
         "config": dataclasses.asdict(net.config),
         "step": 0,
         "data": "untrained",
+        "options": {"usual": True},
     }
     (folder / "manifest.json").write_text(json.dumps(manifest))
     return folder / "checkpoint.safetensors"
@@ -48,7 +49,7 @@ def write_tiny_checkpoint(folder: Path, seed: int = 0, network: str = "sparse") 
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
 def main(out: Path) -> None:
     """Write the tiny models into OUT."""
-    for network, name in (("sparse", "tiny.onnx"), ("unet", "tiny-single.onnx")):
+    for network, name in (("sparse", "tiny.onnx"), ("unet", "tiny-paper.onnx")):
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = write_tiny_checkpoint(Path(folder), network=network)
             spec = export_model(checkpoint, out / name)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from gcar_deploy.predict.center_predictor import open_predictor
-from gcar_deploy.predict.kinds import read_predictor
-from gcar_export.shipping.task_check import scores
+from gcar_deploy.predict.kinds import PAPER, read_predictor
+from gcar_export.shipping.task_check import REACH_PIXELS, scores
 
 
 def verify_model(path: Path, scenes: int) -> str:
-    """Run ``scenes`` generated scenes and say how well their vessel is found.
+    """Run ``scenes`` generated scenes and say how well their vessel is found; see ``task_check``.
 
     Raises
     ------
@@ -22,9 +22,14 @@ def verify_model(path: Path, scenes: int) -> str:
     from gcar_deploy.cli.model_card import card
 
     model = read_predictor(path)
-    dice: dict[str, list[float]] = {}
+    found: dict[str, list[float]] = {}
     for kind, score in scores(model, scenes):
-        dice.setdefault(kind, []).append(score)
+        found.setdefault(kind, []).append(score)
+    named = (
+        f"share of lone centres within {REACH_PIXELS:g} pixels"
+        if model.kind == PAPER.name
+        else "Dice at 0.5 on the hull"
+    )
     lines = card(model)
     worst = open_predictor(model, threads=1).session.check_golden()
     lines.append(
@@ -34,7 +39,6 @@ def verify_model(path: Path, scenes: int) -> str:
     )
     lines.append("through the runtime's own predictor, on generated scenes:")
     lines += [
-        f"  {kind}: Dice at 0.5 on the hull {np.mean(v):.3f} ({len(v)} scenes)"
-        for kind, v in sorted(dice.items())
+        f"  {kind}: {named} {np.mean(v):.3f} ({len(v)} scenes)" for kind, v in sorted(found.items())
     ]
     return "\n".join(lines)

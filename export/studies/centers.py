@@ -14,11 +14,14 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.measure.metrics import skeleton
+from gcar_deploy.predict.center_map import DEPTH_PIXELS, encode_depth
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.centers import Seen, seen_by_all
 from gcar_deploy.predict.decision import decide
-from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.types import Points, Volume
+from gcar_export.scenes.capsules import Capsules
+from gcar_export.scenes.render import path_and_depth
+from gcar_export.training.paper_dataset import targets
 
 
 def pose(angiograms: Sequence[Angiogram], grid: Grid) -> Seen:
@@ -32,20 +35,34 @@ def predicted(predictor: Predictor, posed: Seen) -> dict[str, Points]:
     """Predicted centres, (n, 3) mm LPS each, by the name of their row.
 
     ``multi``: hull points decided to be vessel, moved by their offset to the centreline.
-    ``single``: likewise, merged from single views; ``single, each view``: what each view says
-    on its own, lifted along its rays.
+    ``paper``: what each view says on its own, lifted along its rays, all views together.
     """
     if isinstance(predictor, SingleViewPredictor):
         alone = predictor.predict([(v.carm, v.path_mm) for v in posed.views])
-        merged = merge_views(alone, posed.hull, posed.encoded)
-        return {
-            "single": merged.points_mm[merged.confidence >= 0.5],
-            "single, each view": np.concatenate([view.points_mm for view in alone]),
-        }
+        return {"paper": np.concatenate([view.points_mm for view in alone])}
     error = max(view.path_error for view in posed.views)
     found = decide(predictor.predict(posed.hull, posed.encoded), posed.encoded, error)
     offset = 0.0 if found.offset_mm is None else found.offset_mm
     return {"multi": (found.points_mm + offset)[found.confidence >= 0.5]}
+
+
+def depth_error_px(predictor: SingleViewPredictor, posed: Seen, tree: Capsules) -> float:
+    """Median error of the depths that single views predict, pixel edges at the isocentre.
+
+    Parameters
+    ----------
+    predictor : SingleViewPredictor
+    posed : Seen, the views that it is asked for
+    tree : Capsules of the true tree, in the scene's frame
+    """
+    wrong = []
+    for view in predictor.predict([(v.carm, v.path_mm) for v in posed.views]):
+        path, ray_mm = path_and_depth(view.picture.carm, tree.starts, tree.ends, tree.radii)
+        depth, known = targets(view.picture, path, ray_mm, view.alpha)
+        there = known[tuple(view.cell.T)]
+        off = encode_depth(view.ray_mm, view.picture) - depth[tuple(view.cell.T)]
+        wrong.append(np.abs(off[there]) * DEPTH_PIXELS)
+    return float(np.median(np.concatenate(wrong)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,24 +21,29 @@ from gcar_deploy.types import Array
 from gcar_export.evaluate.evaluate import find_labels
 from gcar_export.methods.predictor_process import peak_mib
 from gcar_export.methods.rtk_timing import pair_carms, projection_pair
+from gcar_export.scenes.label_trees import capsules_of
 from gcar_export.scenes.labels import read_label
 from gcar_export.scenes.protocols import Case, make_case
-from gcar_export.studies.centers import Truth, pose, predicted
+from gcar_export.studies.centers import Truth, depth_error_px, pose, predicted
 
 #: how near counts, voxels of the protocol's grid (1.41 mm paper, 1 mm clinical)
 REACH_VOXELS = 1.5
-ORDER = ("multi", "single", "single, each view")
+ORDER = ("multi", "paper")
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One predictor on one tree: shares of centres and of centreline, 0 .. 1."""
+    """One predictor on one tree: shares of centres and of centreline, 0 .. 1.
+
+    ``depth_px`` is the median error of depth, pixel edges, for predictors of single views.
+    """
 
     case: str
     name: str
     precision: float
     recall: float
     centers: int
+    depth_px: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,9 +104,12 @@ def measure(
         posed, truth = pose(case.angiograms(), case.grid), Truth.of(case.truth, case.grid)
         reach = REACH_VOXELS * float(np.mean(case.grid.spacing_mm))
         for _, predictor in models:
+            depth = None
+            if isinstance(predictor, SingleViewPredictor):
+                depth = depth_error_px(predictor, posed, capsules_of(case.label))
             for name, centers in predicted(predictor, posed).items():
                 precision, recall = truth.scores(centers, reach)
-                rows.append(Row(case.name, name, precision, recall, len(centers)))
+                rows.append(Row(case.name, name, precision, recall, len(centers), depth))
         if progress:
             progress(done + 1, len(files), case.name)
     return rows
@@ -177,8 +185,8 @@ def table(rows: Sequence[Row], costs: Sequence[Cost], protocol: str) -> str:
     """Markdown: mean and SD over trees, the lowest and highest, then the cost."""
     out = [
         f"| {protocol}: predictor | centres near the vessel % | centreline near a centre % "
-        "| lowest .. highest | centres |",
-        "|---|---|---|---|---|",
+        "| lowest .. highest | centres | depth off by, pixels |",
+        "|---|---|---|---|---|---|",
     ]
     for name in [n for n in ORDER if any(r.name == n for r in rows)]:
         own = [r for r in rows if r.name == name]
@@ -188,7 +196,7 @@ def table(rows: Sequence[Row], costs: Sequence[Cost], protocol: str) -> str:
             f"| {name} (n={len(own)}) | {p.mean():.1f} ± {p.std(ddof=spread):.1f} "
             f"| {r.mean():.1f} ± {r.std(ddof=spread):.1f} "
             f"| {p.min():.1f} .. {p.max():.1f} / {r.min():.1f} .. {r.max():.1f} "
-            f"| {np.mean([x.centers for x in own]):.0f} |"
+            f"| {np.mean([x.centers for x in own]):.0f} | {_mean_depth(own)} |"
         )
     if costs:
         out += [
@@ -203,3 +211,10 @@ def table(rows: Sequence[Row], costs: Sequence[Cost], protocol: str) -> str:
             for c in costs
         ]
     return "\n".join(out)
+
+
+def _mean_depth(rows: Sequence[Row]) -> str:
+    known = [row.depth_px for row in rows if row.depth_px is not None]
+    if not known:
+        return "-"
+    return f"{np.mean(known):.1f} ({min(known):.1f} .. {max(known):.1f})"

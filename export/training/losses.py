@@ -9,10 +9,11 @@ What the printed formulae leave open, and the reading taken here:
   2 log(1 + Iter / 20000); ``decaying`` is 2 log(20000 / Iter), clamped at zero.
 - SILog takes logarithms of d + 1e-3 with d in 0 .. 1, the variance is the biased one, and
   sqrt(x + 1e-8) - 1e-4 keeps the slope finite at exact agreement.
-- The gradient and masked terms are means, not sums, so they do not depend on the picture's size.
-  The printed 0.01 weighs sums; ``DEPTH_SCALE`` stands for what they are larger. Without it the
-  slope of clDice, noise far from the truth, outweighs that of depth seventy times (measured), and
-  what depth has learned is lost again.
+- ``sum`` takes the gradient and masked terms as printed, sums over the map, and 0.01 of all three.
+  ``mean`` (default) takes means, which do not depend on the picture's size; the printed 0.01
+  weighs sums, and ``DEPTH_SCALE`` stands for what they are larger. Without it the slope of clDice,
+  noise far from the truth, outweighs that of depth seventy times (measured), and what depth has
+  learned is lost again; with sums the gradient term alone carries nearly all of the slope.
 - clDice is the printed Dice of two skeletons, with the smoothing of Shit et al. 2021.
 - A term that is undefined (no predicted point, no true one, fewer than two pixels) is None: the
   sample is left out of that term and counted.
@@ -35,6 +36,7 @@ LOG_OFFSET = 1e-3
 MEAN_WEIGHT = 0.15
 #: see above
 DEPTH_SCALE = 100.0
+DEPTH_TERMS = ("mean", "sum")
 
 
 def chamfer_weight(iteration: int, start: int = PAPER_START, schedule: str = "clamp") -> float:
@@ -88,8 +90,13 @@ def silog(predicted: torch.Tensor, truth: torch.Tensor) -> torch.Tensor | None:
     return 10.0 * (torch.sqrt(spread + 1e-8) - 1e-4)
 
 
+def depth_weight(terms: str = "mean") -> float:
+    """gamma3 of a reading of the depth loss, one of ``DEPTH_TERMS``."""
+    return GAMMA_DEPTH * (DEPTH_SCALE if terms == "mean" else 1.0)
+
+
 def depth_loss(
-    predicted: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor
+    predicted: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor, terms: str = "mean"
 ) -> torch.Tensor | None:
     """SILog + gradient L1 + masked squared error over one picture's foreground.
 
@@ -97,22 +104,31 @@ def depth_loss(
     ----------
     predicted, truth : (h, w) depth 0 .. 1
     mask : (h, w) bool, where the truth is known
+    terms : one of ``DEPTH_TERMS``, what the second and third term are over the map
 
     Returns
     -------
     scalar, or None where fewer than two pixels are known
+
+    Raises
+    ------
+    ValueError
+        Unknown ``terms``.
     """
+    if terms not in DEPTH_TERMS:
+        raise ValueError(f"terms {terms!r} is none of {', '.join(DEPTH_TERMS)}")
     predicted, truth = predicted.float(), truth.float()
     scale = silog(predicted[mask], truth[mask])
     if scale is None:
         return None
     wrong = torch.where(mask, predicted - truth, torch.zeros_like(predicted))
-    total = scale + wrong.square().sum() / mask.sum()
+    mean = terms == "mean"
+    total = scale + wrong.square().sum() / (mask.sum() if mean else 1)
     for dim in (0, 1):
         n = mask.shape[dim]
         both = mask.narrow(dim, 0, n - 1) & mask.narrow(dim, 1, n - 1)
         step = torch.where(both, wrong.diff(dim=dim), torch.zeros_like(wrong.narrow(dim, 1, n - 1)))
-        total = total + step.abs().sum() / both.sum().clamp(min=1)
+        total = total + step.abs().sum() / (both.sum().clamp(min=1) if mean else 1)
     return total
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from gcar_deploy.errors import UsageError
 from gcar_export.scenes.capsules import LabelTree
 
-NETWORKS = ("multi", "single")
+NETWORKS = ("multi", "paper")
 
 
 def start(
@@ -44,11 +44,11 @@ def start(
         warm start that the network does not have.
     """
     from gcar_export.training import multi as train_multi
-    from gcar_export.training import single as train_single
+    from gcar_export.training import paper as train_paper
 
     if network not in NETWORKS:
         raise UsageError(f"network {network!r} is none of {', '.join(NETWORKS)}")
-    if network == "single" and (preset == "tune" or warm_start is not None):
+    if network == "paper" and (preset == "tune" or warm_start is not None):
         raise UsageError("network single starts from random weights: no preset tune, no warm start")
     trees: list[LabelTree] = []
     hashes: dict[str, str] = {}
@@ -69,10 +69,10 @@ def start(
             label_hashes=hashes, warm_start=warm_start,
         )  # fmt: skip
     else:
-        single = dataclasses.replace(train_single.PRESETS[preset], **changes)
+        single = dataclasses.replace(train_paper.PRESETS[preset], **changes)
         _check_device(single.device)
-        train_single.train(
-            out, single, train_single.CONFIGS[preset], until=until, labels=trees,
+        train_paper.train(
+            out, single, train_paper.CONFIGS[preset], until=until, labels=trees,
             label_hashes=hashes,
         )  # fmt: skip
 

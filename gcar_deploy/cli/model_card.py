@@ -14,10 +14,10 @@ def card(model: ModelFile) -> list[str]:
     training = spec.get("training", {})
     what = {
         "multi": "all views at once: which hull points are vessel",
-        "single": "the paper's: one view at a time, a depth and an offset per cell",
+        "paper": "the paper's: one view at a time, a depth and an offset per cell",
     }[model.kind]
     out = [
-        f"{model.name}: {model.kind}-view Gaussian centre predictor ({what})",
+        f"{model.name}: Gaussian centre predictor ({what})",
         f"  SHA-256 {model.sha256}, as its spec says",
         f"  {spec.get('parameters', 0):,} parameters, {len(model.data):,} bytes, "
         f"{spec.get('precision', 'float32')}, opset {spec.get('opset')}, "

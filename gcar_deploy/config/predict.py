@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias, get_args
 
 from gcar_deploy.config.ranges import Range, Size
 
-PredictorName: TypeAlias = Literal["auto", "multi", "single", "none"]
+PredictorName: TypeAlias = Literal["auto", "multi", "paper", "none"]
 PREDICTORS = get_args(PredictorName)
 
 

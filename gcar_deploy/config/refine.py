@@ -84,11 +84,12 @@ class PaperOptions:
     device: Device = "cpu"
 
 
-#: as printed: 10,000 Gaussians to begin with, whom density control may add to, up to 8,000
-#: iterations; what is not printed is as in ``PaperOptions``
+#: as printed: density control that may add to 10,000 Gaussians, up to 8,000 iterations; what is not
+#: printed is as in ``PaperOptions`` but for the pull that clones, chosen on a generated tree
 PRINTED = PaperOptions(
-    steps=8_000, control_every=100, patience=8_000, most_gaussians=20_000, least_confidence=0.0
-)
+    steps=8_000, control_every=100, pull_ratio=1.5, patience=8_000, most_gaussians=12_000,
+    least_confidence=0.0,
+)  # fmt: skip
 #: as in the code that was released: plain L2, rates of 1.6e-4 of the cube's 180 mm (falling to 0.29
 #: of it), 0.005 (log scale), 0.001 (rotation) and 0.01 (intensity)
 RELEASED = dataclasses.replace(

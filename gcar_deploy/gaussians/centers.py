@@ -20,9 +20,10 @@ class CenterPoints:
     radius_mm : (n,) expected vessel radius at the point, mm; NaN where unknown
     spacing_mm : float
         Edge of the lattice cells the points stand for, mm: ``confidence * spacing_mm**3``
-        sums to the vessel's volume.
+        sums to the vessel's volume. A centre of a single view stands for all that its cell shows,
+        which may be more than a cell holds.
     source : str
-        ``"multi"``, ``"single"`` or ``"hull"``.
+        ``"multi"``, ``"hull"``, or ``"paper"`` for centres of single views, each on its own.
     offset_mm : (n, 3) or None
         From the point to the nearest point of the centreline, mm, where the predictor says so.
     """

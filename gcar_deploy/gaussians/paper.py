@@ -70,7 +70,9 @@ def initial_gaussians(centers: CenterPoints, options: PaperOptions) -> Gaussians
     Gaussian takes the mass (confidence times spacing^3 of each), the centre and the spread of
     its points, to which a single point's own ``initial_sigma_cells`` is added.
     """
-    used = centers.select(centers.confidence >= options.least_confidence)
+    # Centres of single views are all used: none was judged against another.
+    least = 0.0 if centers.source == "paper" else options.least_confidence
+    used = centers.select(centers.confidence >= least)
     h = used.spacing_mm
     order = np.argsort(-used.confidence, kind="stable")
     if options.thin_cells > 0:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Array, Volume
 
 #: half width of a Gaussian's box in standard deviations; beyond lies 0.02 % of the mass
 CUT_SIGMAS = 4.0
+#: of ``points_of``: cells round the Gaussians, and the occupancy below which a cell is left out
+_MARGIN_CELLS, _LEAST_SHARE = 3, 0.02
 #: Gaussians whose boxes hold about as many voxels are done together
 _BUCKET = 1.6
 
@@ -45,6 +48,29 @@ def voxelize(gaussians: Gaussians, grid: Grid) -> Volume:
         for part in np.array_split(chosen, max(1, len(chosen) * width**3 >> 22)):
             _add(volume, grid, low[part], width, centre[part], inverse[part], in_voxels[part])
     return volume.reshape(grid.shape).astype(np.float32)
+
+
+def points_of(gaussians: Gaussians, cell_mm: float) -> CenterPoints:
+    """Return the occupancy of a lattice over the Gaussians as points, empty cells left out."""
+    if len(gaussians) == 0:
+        nothing = np.zeros(0)
+        return CenterPoints(points_mm=np.zeros((0, 3)), confidence=nothing, radius_mm=nothing,
+                            spacing_mm=cell_mm, source="paper")  # fmt: skip
+    # A few Gaussians that ran away must not make the lattice large.
+    low, high = np.percentile(gaussians.means_mm, [0.5, 99.5], axis=0)
+    count = np.ceil((high - low) / cell_mm).astype(int) + 2 * _MARGIN_CELLS
+    (x, y, z), (nx, ny, nz) = (0.5 * (low + high)).tolist(), count.tolist()
+    size = (nx * cell_mm, ny * cell_mm, nz * cell_mm)
+    grid = Grid(center_mm=(x, y, z), size_mm=size, shape=(nx, ny, nz))
+    share = np.clip(voxelize(gaussians, grid), 0.0, 1.0)
+    filled = np.argwhere(share > _LEAST_SHARE)
+    return CenterPoints(
+        points_mm=grid.index2world(filled),
+        confidence=share[tuple(filled.T)].astype(np.float64),
+        radius_mm=np.full(len(filled), np.nan),
+        spacing_mm=cell_mm,
+        source="paper",
+    )
 
 
 def _add(

@@ -17,7 +17,7 @@ from gcar_deploy.models import Kind, ModelFile, Session
 from gcar_deploy.predict.center_map import OUTPUTS, ViewCenters, decode, net_picture
 from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
 from gcar_deploy.predict.hull import Candidates
-from gcar_deploy.predict.kinds import MULTI, PREDICTORS, SINGLE, read_predictor
+from gcar_deploy.predict.kinds import MULTI, PAPER, PREDICTORS, read_predictor
 from gcar_deploy.types import Image
 
 _log = logging.getLogger(__name__)
@@ -80,6 +80,12 @@ class SingleViewPredictor:
         self.model = model
         self.session = Session(model, self.input_names(), threads=threads, runtime=session)
 
+    @property
+    def directions_deg(self) -> list[list[float]]:
+        """(primary, secondary) of the views that the model was trained on; none: any."""
+        directions: list[list[float]] = self.model.inputs["directions_deg"]
+        return directions
+
     def input_names(self) -> list[str]:
         """Names of the graph's inputs; the axes only where the model is told the pose."""
         return ["picture", "axes"] if self.model.inputs["pose"] else ["picture"]
@@ -124,7 +130,7 @@ Predictor: TypeAlias = CenterPredictor | SingleViewPredictor
 
 def open_predictor(model: ModelFile, *, threads: int = 2, session: Any = None) -> Predictor:
     """Return the predictor that a model file is made for."""
-    opened = SingleViewPredictor if model.kind == SINGLE.name else CenterPredictor
+    opened = SingleViewPredictor if model.kind == PAPER.name else CenterPredictor
     return opened(model, threads=threads, session=session)
 
 

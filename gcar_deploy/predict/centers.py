@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from gcar_deploy.config import CandidateOptions, RunOptions
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -18,15 +18,16 @@ from gcar_deploy.predict.hull import Candidates, cubic_lattice, visual_hull
 from gcar_deploy.predict.lattices import mean_evidence, near_evidence, shifted_lattice
 from gcar_deploy.predict.resolution import Resolution, resolution
 from gcar_deploy.predict.same_branch import without_ghosts
-from gcar_deploy.predict.single_view import merge_views
 from gcar_deploy.predict.thinning import thin_hull
+from gcar_deploy.predict.view_centers import known_views, placed_centers
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Image
 
 _THINNED = "no model was used: depth was decided by thinning the visual hull"
-_ALONE = "depth was decided by a model that sees one view at a time, which takes ghosts for vessels"
+_ALONE = "depth was guessed by a model that sees one view at a time: it is off by a centimetre"
+_STRANGE = "no view has a direction that the model was trained on"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,8 +126,7 @@ def find_centers(
         return Centers(thinned, findings=(_THINNED,))
     stop = watch.question
     if isinstance(predictor, SingleViewPredictor):
-        alone = predictor.predict([(view.carm, view.path_mm) for view in seen.views], stop)
-        return Centers(merge_views(alone, seen.hull, seen.encoded), findings=(_ALONE,))
+        return _placed(seen, predictor, stop)
     predicted = predictor.predict(seen.hull, seen.encoded, stop)
     others = []
     for number in range(1, options.predict.lattices):
@@ -142,6 +142,15 @@ def find_centers(
     return Centers(decided, Evidence(predicted, seen.encoded.ray, seen.encoded.weight))
 
 
+def _placed(seen: Seen, predictor: SingleViewPredictor, stop: Callable[[], bool] | None) -> Centers:
+    """Centres of the views that the model was trained for; the others take part later."""
+    carms = [view.carm for view in seen.views]
+    known = known_views(carms, predictor.directions_deg)
+    used = [seen.views[k] for k in known] or seen.views
+    alone = predictor.predict([(view.carm, view.path_mm) for view in used], stop)
+    return Centers(placed_centers(alone), findings=(_ALONE,) if known else (_ALONE, _STRANGE))
+
+
 def quick_tree(
     views: Sequence[VesselImage],
     grid: Grid,
@@ -154,5 +163,7 @@ def quick_tree(
     watch.check()
     if len(seen.hull) == 0:
         return empty_tree()
+    if isinstance(predictor, SingleViewPredictor):
+        predictor = None  # centres a centimetre off say nothing of millimetres between the runs
     once = dataclasses.replace(options, predict=dataclasses.replace(options.predict, lattices=1))
     return build_tree(find_centers(seen, predictor, once, watch).points)

@@ -24,15 +24,26 @@ def _unfit_picture(inputs: Mapping[str, Any]) -> str:
         return "has inputs.pixels that is no multiple of inputs.alpha"
     if not isinstance(inputs.get("pose"), bool):
         return f"wants inputs.pose = {inputs.get('pose')!r}, not a bool"
+    directions = inputs.get("directions_deg")
+    if not isinstance(directions, list) or not all(map(_is_direction, directions)):
+        return f"wants inputs.directions_deg = {directions!r}, not pairs of angles"
     return ""
+
+
+def _is_direction(value: Any) -> bool:
+    if not isinstance(value, list) or len(value) != 2:
+        return False
+    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in value) and (
+        abs(value[0]) <= 180 and abs(value[1]) <= 90
+    )
 
 
 #: all views at once: which points of the hull are vessel
 MULTI = Kind("multi", "gcp-multi", {"view_features": VIEW_FEATURES, "levels": LEVELS})
 #: the paper's: one view at a time, a depth and an offset per cell
-SINGLE = Kind(
-    "single",
-    "gcp-single",
+PAPER = Kind(
+    "paper",
+    "gcp-paper",
     {
         "depth_pixels": DEPTH_PIXELS,
         "offset_pixels": OFFSET_PIXELS,
@@ -41,7 +52,7 @@ SINGLE = Kind(
     _unfit_picture,
 )
 #: by the name of their kind
-PREDICTORS = {kind.name: kind for kind in (MULTI, SINGLE)}
+PREDICTORS = {kind.name: kind for kind in (MULTI, PAPER)}
 
 
 def read_predictor(path: Path, limits: ModelLimits | None = None) -> ModelFile:

@@ -13,7 +13,8 @@ from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.gaussians.voxelize import voxelize
+from gcar_deploy.gaussians.paper import initial_gaussians, refine_paper
+from gcar_deploy.gaussians.voxelize import points_of, voxelize
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.stopwatch import Budget
@@ -34,6 +35,8 @@ MOST_LEFT = 0.5
 OnProgress = Callable[[float], None]
 #: a place on a branch that is to go may be so far off its centreline, mm
 DELETED_WITHIN_MM = 2.0
+#: trees of centres that stand on no lattice are made on one no coarser than this, mm
+LARGEST_CELL_MM = 1.5
 _FINDINGS = {
     "late": "the deadline left no time to refine",
     "stopped": "the deadline ended the refinement early",
@@ -49,7 +52,8 @@ class Refined:
     refiner : str
     gaussians : Gaussians, possibly none
     tree : Tree
-        Made of ``centers`` as they are where the refiner has none of its own (``paper``).
+        Where the refiner has none of its own (``paper``), made of ``centers`` as they are, or, of
+        centres of single views, which are no vessels yet, of the fitted Gaussians.
     losses : (k,) objective after each accepted step
     steps, rejected_steps : int
     status : str
@@ -157,13 +161,18 @@ def refine(
     if not views:
         raise UsageError("refinement needs at least one view")
     budget = budget or Budget()
+    placed = centers
+    if centers.source == "paper":
+        # Centres of single views stand anywhere; trees are made on a lattice.
+        spread = initial_gaussians(centers, options.paper)
+        centers = points_of(spread, min(centers.spacing_mm, LARGEST_CELL_MM))
     if not budget.enough or options.refiner != "tube":
         start = _unrefined(centers, len(views))
         if not budget.enough:
             return dataclasses.replace(start, status="late")
         if options.refiner == "none":
             return start
-        return _paper(start, views, options, on_progress, budget.should_stop)
+        return _paper(start, placed, views, options, on_progress, budget.should_stop)
     fit = fit_tubes(centers, views, options.tube, budget.should_stop)
     if on_progress is not None:
         on_progress(1.0)
@@ -242,19 +251,22 @@ def _unrefined(centers: CenterPoints, views: int) -> Refined:
 
 def _paper(
     start: Refined,
+    centers: CenterPoints,
     views: Sequence[VesselImage],
     options: RefineOptions,
     on_progress: OnProgress | None,
     should_stop: Callable[[], bool] | None,
 ) -> Refined:
-    from gcar_deploy.gaussians.paper import refine_paper
-
     out = refine_paper(
-        start.centers, views, options.paper, on_progress=on_progress, should_stop=should_stop
+        centers, views, options.paper, on_progress=on_progress, should_stop=should_stop
     )
+    tree = start.tree
+    if centers.source == "paper":
+        tree = build_tree(points_of(out.gaussians, start.centers.spacing_mm))
     return dataclasses.replace(
         start,
         refiner="paper",
+        tree=tree,
         gaussians=out.gaussians,
         losses=tuple(out.losses),
         steps=out.steps,

@@ -257,7 +257,7 @@ USAGE = {
     "three pictures for two views": (["run", "V", "W", "V", "--geom", "G", "--out", "O"], 4),
     "missing model": (["run", "V", "W", "--geom", "G", "--out", "O", "--model", "m.onnx"], 5),
     "a picture for a model": (["run", "V", "W", "--geom", "G", "--out", "O", "--model", "V"], 5),
-    "no such single model": (
+    "no such paper model": (
         [
             "run",
             "V",
@@ -267,7 +267,7 @@ USAGE = {
             "--out",
             "O",
             "--predictor",
-            "single",
+            "paper",
             "--model",
             "m.onnx",
         ],

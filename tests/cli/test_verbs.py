@@ -233,11 +233,11 @@ def test_doctor_passes_its_self_test():
     report = json.loads(done.out)
     assert report["self_test"]["passed"] and report["torch_imported"] == before
     assert report["versions"]["numpy"]
-    assert {one["name"] for one in report["models"]} == {"gcp-multi", "gcp-single", "segmenter"}
+    assert {one["name"] for one in report["models"]} == {"gcp-multi", "gcp-paper", "segmenter"}
     assert all(one["sound"] and one["golden"] < 1e-3 for one in report["models"])
 
 
-@pytest.mark.parametrize("name", ["gcp-multi", "gcp-single", "segmenter"])
+@pytest.mark.parametrize("name", ["gcp-multi", "gcp-paper", "segmenter"])
 @pytest.mark.parametrize("fault", ["missing", "altered"])
 def test_doctor_checks_every_shipped_model(name, fault, tmp_path, monkeypatch):
     for file in MULTI.path.parent.iterdir():
@@ -324,24 +324,25 @@ def test_the_progress_bar_is_for_terminals_only(monkeypatch, capsys):
     assert "refine" not in capsys.readouterr().err
 
 
-def test_run_with_the_single_view_predictor_says_so(good_case, tmp_path):
-    out = tmp_path / "single"
+def test_run_with_the_papers_predictor_and_refinement_is_never_ok(good_case, tmp_path):
+    out = tmp_path / "paper"
     pictures = [good_case / f"view{k}.png" for k in (1, 2)]
     done = gcar("run", *pictures, "--geom", good_case / "geom.json", "--out", out,
-                "--predictor", "single")  # fmt: skip
+                "--predictor", "paper", "--refiner", "paper")  # fmt: skip
     assert done.code == 0, done.err
     summary = json.loads((out / "result.json").read_text())
-    assert summary["predictor"] == "single" and summary["model"]["name"] == "gcp-single"
+    assert (summary["predictor"], summary["refiner"]) == ("paper", "paper")
+    assert summary["status"] == "degraded" and summary["model"]["name"] == "gcp-paper"
 
 
-@pytest.mark.parametrize("kind", ["multi", "single"])
+@pytest.mark.parametrize("kind", ["multi", "paper"])
 def test_info_prints_the_card_of_a_model(kind, tmp_path):
     path = PREDICTORS[kind].path
     done = gcar("info", path)
-    assert done.code == 0 and f"gcp-{kind}: {kind}-view Gaussian centre predictor" in done.out
+    assert done.code == 0 and f"gcp-{kind}: Gaussian centre predictor" in done.out
     spec = json.loads(path.with_suffix(".json").read_text())
     assert spec["sha256"] in done.out and f"{spec['parameters']:,} parameters" in done.out
-    assert "trained on: generated trees alone" in done.out.replace("trees only", "trees alone")
+    assert "trained on: generated trees" in done.out
     assert json.loads(gcar("info", path, "--json").out) == spec
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1

@@ -1,5 +1,7 @@
 """Scores of predicted centres in closed form, the table on a real tree, memory of a process."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -10,11 +12,13 @@ from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.kinds import read_predictor
 from gcar_export.cli.main import main
 from gcar_export.methods.predictor_process import peak_mib
+from gcar_export.scenes.capsules import Capsules
 from gcar_export.shipping.golden import golden_inputs
-from gcar_export.studies.centers import Truth
+from gcar_export.studies.centers import Truth, depth_error_px
 from gcar_export.studies.centers_table import Cost, Row, open_models, table
 from tests.conftest import data_dir
-from tests.predict.test_single_view import TINY
+from tests.predict.test_hull import helix, scene
+from tests.predict.test_view_centers import TINY, true_centers
 
 GRID = Grid(center_mm=(0, 0, 0), size_mm=(40, 40, 40), shape=(40, 40, 40))
 
@@ -44,25 +48,37 @@ def test_no_centre_is_no_precision_and_no_recall(tube):
 
 
 def test_table_has_a_row_per_predictor_and_its_cost():
-    rows = [Row("a", "single", 0.5, 0.25, 90), Row("b", "single", 0.7, 0.75, 110),
+    rows = [Row("a", "paper", 0.5, 0.25, 90, 6.0), Row("b", "paper", 0.7, 0.75, 110, 8.0),
             Row("a", "multi", 1.0, 1.0, 100)]  # fmt: skip
     text = table(rows, [Cost("multi", 1.5, 1.25, 0.3, 0.2, 230.4)], "paper")
     assert "| multi (n=1) | 100.0 ± 0.0 | 100.0 ± 0.0 |" in text
-    assert (
-        "| single (n=2) | 60.0 ± 14.1 | 50.0 ± 35.4 | 50.0 .. 70.0 / 25.0 .. 75.0 | 100 |" in text
-    )
-    assert text.index("| multi (n=1)") < text.index("| single (n=2)")
+    line = "| paper (n=2) | 60.0 ± 14.1 | 50.0 ± 35.4 | 50.0 .. 70.0 / 25.0 .. 75.0 | 100 "
+    assert f"{line}| 7.0 (6.0 .. 8.0) |" in text
+    assert text.index("| multi (n=1)") < text.index("| paper (n=2)")
     assert "| multi | 1.50 | 1.25 | 0.300 | 0.200 | 230 |" in text
+
+
+def test_depth_that_is_off_by_so_much_is_said_to_be():
+    """Every centre moved along its ray by three pixels: the median error is three pixels."""
+    line = helix()
+    tree = Capsules(line[:-1], line[1:], np.full(len(line) - 1, 1.6))
+    views = scene(((0, 0), (90, 0)))
+    alone = true_centers(views)
+    for view in alone:
+        view.ray_mm[:] += 3.0 * view.picture.pixel_mm
+    predictor = SimpleNamespace(predict=lambda _: alone)
+    seen = SimpleNamespace(views=[SimpleNamespace(carm=c, path_mm=p) for c, p in views])
+    assert depth_error_px(predictor, seen, tree) == pytest.approx(3.0, abs=0.05)
 
 
 def test_models_by_kind_or_path(monkeypatch, tmp_path):
     (path, predictor), = open_models([str(TINY)])  # fmt: skip
-    assert path == TINY and predictor.model.kind == "single"
+    assert path == TINY and predictor.model.kind == "paper"
     with pytest.raises(ModelError, match=r"none\.onnx"):
         open_models([str(tmp_path / "none.onnx")])
     monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: None)
-    with pytest.raises(UsageError, match="no single model is installed"):
-        open_models(["single"])
+    with pytest.raises(UsageError, match="no paper model is installed"):
+        open_models(["paper"])
 
 
 def test_a_process_with_only_the_predictor_stays_small():
@@ -78,9 +94,7 @@ def test_real_tree_through_the_command():
     assert done.exit_code == 0, done.output
     lines = {line.split("|")[1].split("(")[0].strip(): line for line in done.output.splitlines()
              if "(n=1)" in line}  # fmt: skip
-    assert list(lines) == ["multi", "single", "single, each view"]
+    assert list(lines) == ["multi", "paper"]
     precision, recall = (float(lines["multi"].split("|")[k].split("±")[0]) for k in (2, 3))
     assert precision > 88 and recall > 88
-    alone, merged = (float(lines[k].split("|")[2].split("±")[0])
-                     for k in ("single, each view", "single"))  # fmt: skip
-    assert alone < merged < precision
+    assert float(lines["paper"].split("|")[2].split("±")[0]) < precision

@@ -264,11 +264,11 @@ def test_rows_depend_on_their_own_settings_alone():
     plain, other = MethodSettings(), MethodSettings(paper_steps=7)
     same = {m for m in METHODS if plain.digest(m) == other.digest(m)}
     assert {"fdk", "sart", "nerp", "visual_hull"} <= same
-    assert not {"hull+paper", "fbp+paper", "multi+paper"} & same
-    assert plain.digest("single+paper") != plain.digest("single+paper-noloss")
+    assert not {"hull+paper", "3dgr-fbp", "multi+paper"} & same
+    assert plain.digest("3dgr-gcp") != plain.digest("3dgr-gcp-l2")
     assert plain.digest("ours") != plain.digest("ours-swapped")
     assert other.run_options("hull+paper").refine.paper.steps == 7
-    assert plain.run_options("single+paper-noloss").refine.paper.alpha == 1.0
+    assert plain.run_options("3dgr-gcp-l2").refine.paper.alpha == 1.0
     assert not plain.run_options("ours-nopose").pose.enabled
     assert not plain.run_options("ours-round").refine.fuse
     assert plain.run_options("ours-classic").imaging.segmenter == "classic"
@@ -282,9 +282,9 @@ def test_a_missing_model_is_said_before_any_work(data, tmp_path, monkeypatch):
     monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: None)
     methods._session.cache_clear()
     options = evaluate.EvaluateOptions(
-        data=data, out=tmp_path / "out", protocol="paper", methods=("fdk", "single+paper")
+        data=data, out=tmp_path / "out", protocol="paper", methods=("fdk", "3dgr-gcp")
     )
-    with pytest.raises(ModelError, match=r"^method single\+paper: predictor single has no model"):
+    with pytest.raises(ModelError, match=r"^method 3dgr-gcp: predictor paper has no model"):
         evaluate.evaluate(options)
     assert not (tmp_path / "out").exists()
 
@@ -372,8 +372,8 @@ def test_paper_layout_keeps_datasets_apart_and_marks_printed_figures():
     rows = [_row("1", "ours", 0.8), _row("1", "fdk", 0.3), _row("1", "nerp", 0.4)]
     rows += [{**_row("2", m, 0.5), "dataset": "ASOCA"} for m in ("ours", "fdk")]
     text = paper_tables.layout(rows, "ours")
-    assert "| ImageCAS (1) | ours | - | - | 80.00 | - |" in text
-    assert "| ASOCA (1) | fdk | - | - | 50.00 | - |" in text
+    assert "| ImageCAS (1) | gcar as it comes | - | - | 80.00 | - |" in text
+    assert "| ASOCA (1) | FBP (FDK) | - | - | 50.00 | - |" in text
     printed = [line for line in text.splitlines() if paper_tables.NOTE in line]
     assert len(printed) == 3  # FBP and NeRP of ImageCAS, FBP of ASOCA: what we have rows of
     assert "31.36 ± 3.33" in printed[0]

@@ -37,7 +37,7 @@ def available():
             check_models([method], SETTINGS)
             out.append(method)
         except ModelError as error:
-            assert "single" in method, error
+            assert "gcp" in method, error
     return tuple(out)
 
 
@@ -88,7 +88,7 @@ def test_methods_keep_their_rank(evaluated):
     }
     assert best["ours"] > 0.6
     assert best["ours"] == best["multi+tube"]
-    for method in ("hull", "visual_hull", "fdk", "sart", "nerp", "fbp+paper"):
+    for method in ("hull", "visual_hull", "fdk", "sart", "nerp", "3dgr-fbp"):
         assert best["ours"] > best[method] + 0.1, method
 
 

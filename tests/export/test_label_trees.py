@@ -17,10 +17,10 @@ from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.raycast import raycast
 from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.training import multi as train_multi
-from gcar_export.training import single as train_single
+from gcar_export.training import paper as train_paper
 from gcar_export.training.dataset import training_scene
 from gcar_export.training.examinations import SceneOptions
-from gcar_export.training.single_dataset import training_pictures
+from gcar_export.training.paper_dataset import training_pictures
 from gcar_export.training.train import start
 
 
@@ -101,13 +101,13 @@ def test_scenes_show_labels_about_as_often_as_asked(folder):
     # The labels' vessels are 1.8 and 2.2 mm in radius throughout, generated ones are not.
     radius = scene.radius_cells[scene.occupancy > 0.9] * scene.spacing_mm
     assert np.ptp(np.percentile(radius, [10, 90])) < 0.5
-    config = train_single.CONFIGS["tiny"]
+    config = train_paper.CONFIGS["tiny"]
     picture = training_pictures(3, 0, config, always, trees)[0]
     assert picture.known.any()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", ["single", "multi"])
+@pytest.mark.parametrize("network", ["paper", "multi"])
 def test_training_with_labels_remembers_them(tmp_path, folder, network):
     start(tmp_path / "run", network, "tiny", labels=folder)
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
@@ -115,7 +115,7 @@ def test_training_with_labels_remembers_them(tmp_path, folder, network):
     assert all(len(h) == 64 for h in manifest["labels"].values())
     with pytest.raises(UsageError, match=r"2 label volumes .* no labels"):
         start(tmp_path / "run", network, "tiny", steps=5)
-    module = train_single if network == "single" else train_multi
+    module = train_paper if network == "paper" else train_multi
     other = dict.fromkeys(manifest["labels"], "0" * 64)
     with pytest.raises(UsageError, match="give another --out, or the same labels"):
         module.train(
@@ -141,5 +141,5 @@ def test_gpu_preset_without_a_gpu_is_one_line(tmp_path):
     if torch.cuda.is_available():
         pytest.skip("this machine has a CUDA device")
     with pytest.raises(UsageError, match="needs a CUDA device"):
-        start(tmp_path / "run", "single", "gpu")
+        start(tmp_path / "run", "paper", "gpu")
     assert not (tmp_path / "run").exists()

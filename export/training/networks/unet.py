@@ -5,9 +5,11 @@ level, as in the denoising U-Nets that the paper follows, a 1 x 1 head with four
 pooling by alpha, then the activations that turn numbers into depth (sigmoid, 0 .. 1) and offset
 (tanh, up to ``OFFSET_PIXELS``). Where in the picture a pixel lies says much about its depth, so
 row and column join the picture as constants, and the coarsest level has a learned map of its own.
+The finest level, whose features are averaged at the end, has one convolution each way and no
+normalisation: a block there costs as much as all coarser ones together.
 
-The paper's views are always taken from the same directions. For views from anywhere (``pose``) the
-axes of the view enter each block where a denoising U-Net takes its noise level.
+One network serves all views: with ``pose`` the axes of the view enter each block where a denoising
+U-Net takes its noise level. For the paper's two fixed views they say no more than which it is.
 """
 
 from __future__ import annotations
@@ -84,8 +86,9 @@ class UNetPredictor(nn.Module):
         self.down = nn.ModuleList([_Block(w[k - 1], w[k], p) for k in range(1, len(w))])
         self.place = nn.Parameter(torch.zeros(1, w[-1], *(2 * (n >> (len(w) - 1),))))
         self.middle = _Block(w[-1], w[-1], p)
-        self.up = nn.ModuleList([_Block(w[k + 1] + w[k], w[k], p) for k in range(len(w) - 1)])
-        self.norm = nn.GroupNorm(_groups(w[0]), w[0])
+        self.up = nn.ModuleList([_Block(w[k + 1] + w[k], w[k], p) for k in range(1, len(w) - 1)])
+        self.narrow = nn.Conv2d(w[1], w[0], 1)
+        self.finest = nn.Conv2d(w[0], w[0], 3, padding=1)
         self.head = nn.Conv2d(w[0], OUTPUTS, 1)
         nn.init.normal_(self.head.weight, std=0.02)
         nn.init.zeros_(self.head.bias)
@@ -108,8 +111,9 @@ class UNetPredictor(nn.Module):
         x = self.middle(x + self.place, told)
         for k in reversed(range(len(self.up))):
             x = nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
-            x = self.up[k](torch.cat([x, skips[k]], dim=1), told)
-        x = self.head(nn.functional.silu(self.norm(x)))
+            x = self.up[k](torch.cat([x, skips[k + 1]], dim=1), told)
+        x = nn.functional.interpolate(self.narrow(x), scale_factor=2.0, mode="nearest") + skips[0]
+        x = self.head(nn.functional.silu(self.finest(nn.functional.silu(x))))
         x = nn.functional.avg_pool2d(x, self.config.alpha) if self.config.alpha > 1 else x
         x = x.float()
         return torch.cat([torch.sigmoid(x[:, :1]), OFFSET_PIXELS * torch.tanh(x[:, 1:])], dim=1)

@@ -1,4 +1,4 @@
-"""The single-view predictor's pictures, loss and training."""
+"""The paper's predictor: pictures, loss and training."""
 
 import dataclasses
 
@@ -10,20 +10,22 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.center_map import decode
+from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.render import path_and_depth, path_lengths
 from gcar_export.training.checkpoint import read_manifest
+from gcar_export.training.losses import depth_loss, depth_weight, silog
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
-from gcar_export.training.run_folder import read_log
-from gcar_export.training.single import (
+from gcar_export.training.paper import (
     CONFIGS,
     PRESETS,
     Batch,
-    SingleOptions,
+    PaperTraining,
     batch_loss,
     learning_rate,
     train,
 )
-from gcar_export.training.single_dataset import training_pictures
+from gcar_export.training.paper_dataset import lumen_points, training_pictures
+from gcar_export.training.run_folder import read_log
 
 CONFIG = UNetConfig(pixels=64, alpha=2, width=(4, 4, 8))
 
@@ -99,7 +101,7 @@ def test_training_lifts_as_deployment_does(drawn):
 
 def test_true_depth_has_a_lower_loss_than_a_wrong_one(drawn):
     batch = Batch.of(drawn, CONFIG.alpha, "cpu")
-    options = SingleOptions(chamfer_start=10, cldice_voxels=32)
+    options = PaperTraining(chamfer_start=10, cldice_voxels=32)
     true = torch.zeros(len(drawn), 4, *batch.depth.shape[1:])
     true[:, 0] = torch.where(batch.known, batch.depth, torch.tensor(0.5))
     wrong = true.clone()
@@ -112,10 +114,49 @@ def test_an_empty_picture_is_left_out_and_counted(drawn):
     batch.cells[0] = False
     batch.known[0] = False
     out = torch.full((2, 4, 32, 32), 0.5, requires_grad=True)
-    loss, left_out = batch_loss(out, batch, 40, SingleOptions(chamfer_start=10, cldice_voxels=16))
+    loss, left_out = batch_loss(out, batch, 40, PaperTraining(chamfer_start=10, cldice_voxels=16))
     loss.backward()
     assert left_out == {"depth": 1, "chamfer": 1}
     assert torch.isfinite(loss) and torch.isfinite(out.grad).all()
+
+
+def test_points_fill_the_lumen_evenly():
+    """A tube of 2 mm and one of 1 mm, as long: four fifths of the points in the wider one."""
+    tube = Capsules(
+        np.array([[0.0, 0, 0], [0, 0, 50]]), np.array([[40.0, 0, 0], [40, 0, 50]]),
+        np.array([2.0, 1.0]),
+    )  # fmt: skip
+    points = lumen_points(np.random.default_rng(0), tube, 20_000)
+    wide = points[:, 2] < 25
+    assert wide.mean() == pytest.approx(0.8, abs=0.02)
+    axis = np.clip(points[:, 0], 0, 40)
+    middle = np.column_stack([axis, np.zeros(len(points)), np.where(wide, 0, 50)])
+    off = np.linalg.norm(points - middle, axis=1)
+    assert (off[wide] <= 2).all() and (off[~wide] <= 1).all()
+    assert np.abs(points[wide, 1]).max() > 1.8
+
+
+def test_the_set_up_is_the_papers_two_views(drawn):
+    for k, p in enumerate(drawn):
+        carm = p.picture.carm
+        assert (carm.primary_angle_deg, carm.secondary_angle_deg) == (90.0 * (k % 2), 0.0)
+        assert carm.pixel_at_isocenter_mm * 64 == pytest.approx(180.0)
+        # Whole trees inside the cube, on both pictures.
+        assert np.abs(p.centerline_mm).max() < 90
+
+
+def test_depth_terms_as_printed_are_the_means_times_their_pixels(drawn):
+    p = drawn[0]
+    depth, known = torch.from_numpy(p.depth), torch.from_numpy(p.known)
+    wrong = torch.where(known, depth + 0.01, depth)
+    # A constant error has no gradient: SILog alone and the square are left.
+    scale = silog(wrong[known], depth[known])
+    mean, total = (depth_loss(wrong, depth, known, terms) for terms in ("mean", "sum"))
+    assert float(mean - scale) == pytest.approx(1e-4, rel=1e-2)
+    assert float(total - scale) == pytest.approx(1e-4 * int(known.sum()), rel=1e-2)
+    assert depth_weight("sum") == pytest.approx(0.01)
+    with pytest.raises(ValueError, match="none of mean, sum"):
+        depth_loss(wrong, depth, known, "median")
 
 
 def test_output_has_its_shape_and_bounds():
@@ -132,7 +173,7 @@ def test_sizes_that_do_not_divide_are_refused(wrong):
 
 
 def test_schedule_is_a_function_of_the_step():
-    o = SingleOptions(steps=100, decay_steps=20, warmup_steps=10, learning_rate=1.0)
+    o = PaperTraining(steps=100, decay_steps=20, warmup_steps=10, learning_rate=1.0)
     assert [learning_rate(o, k) for k in (0, 9, 79, 90, 100)] == pytest.approx([0.1, 1, 1, 0.5, 0])
 
 
@@ -163,8 +204,8 @@ def test_training_resumes_to_the_bit(tmp_path):
 def test_a_step_in_bfloat16_stays_near_one_in_float32(tmp_path):
     """The code path of the gpu preset, as far as a CPU goes."""
     one = dataclasses.replace(PRESETS["tiny"], steps=1, decay_steps=1)
-    train(tmp_path / "full", one, CONFIGS["tiny"])
-    train(tmp_path / "half", dataclasses.replace(one, bf16=True), CONFIGS["tiny"])
+    train(tmp_path / "full", dataclasses.replace(one, bf16=False), CONFIGS["tiny"])
+    train(tmp_path / "half", one, CONFIGS["tiny"])
     a, b = (load_file(tmp_path / k / "checkpoint.safetensors") for k in ("full", "half"))
     assert any(not torch.equal(a[k], b[k]) for k in a)
     for key in a:

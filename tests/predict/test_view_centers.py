@@ -1,4 +1,4 @@
-"""The single-view predictor in the runtime: the true ONNX path, merging, ways to be wrong."""
+"""The paper's predictor in the runtime: true rays, the true ONNX path, ways to be wrong."""
 
 import dataclasses
 import json
@@ -7,23 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gcar_deploy import Engine, RunOptions
-from gcar_deploy.config import CandidateOptions, PredictOptions
+from gcar_deploy.config import PaperOptions, PredictOptions, RefineOptions
 from gcar_deploy.errors import ModelError, NumericalError
 from gcar_deploy.predict.center_map import decode, encode_depth, net_picture
 from gcar_deploy.predict.center_predictor import SingleViewPredictor, open_predictor
-from gcar_deploy.predict.encoding import encode
-from gcar_deploy.predict.hull import visual_hull
 from gcar_deploy.predict.kinds import read_predictor
-from gcar_deploy.predict.single_view import DEPTH_SCALE_PIXELS, agreement, merge_views
+from gcar_deploy.predict.view_centers import known_views, placed_centers
 from gcar_deploy.selftest import tiny_case
 
 pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
-from tests.predict.test_hull import GRID, helix, scene
+from tests.predict.test_hull import helix, scene
 
-TINY = Path(__file__).parents[1] / "data" / "tiny-single.onnx"
-SINGLE = RunOptions(predict=PredictOptions(predictor="single"))
+TINY = Path(__file__).parents[1] / "data" / "tiny-paper.onnx"
+PAPER = RunOptions(
+    predict=PredictOptions(predictor="paper"),
+    refine=RefineOptions(refiner="paper", paper=PaperOptions(steps=60, control_every=20)),
+)
 
 
 def true_centers(views, error_mm=0.0, rng=None):
@@ -44,53 +46,45 @@ def true_centers(views, error_mm=0.0, rng=None):
     return out
 
 
-def dice(confidence, truth):
-    a, b = confidence >= 0.5, truth >= 0.5
-    return 2 * (a & b).sum() / (a.sum() + b.sum())
-
-
-@pytest.fixture(scope="module")
-def hull():
-    from gcar_export.scenes.render import occupancy
-
-    views = scene(((-30, -20), (45, 25)))
-    found = visual_hull(views, GRID, CandidateOptions())
-    encoded = encode(found, [(c, p, True) for c, p in views])
+def test_centres_of_both_views_stand_side_by_side_and_hold_the_vessel_once():
+    views = scene(((0, 0), (90, 0)))
+    alone = true_centers(views)
+    placed = placed_centers(alone)
+    assert placed.source == "paper" and len(placed) == sum(len(v.cell) for v in alone)
+    np.testing.assert_array_equal(placed.points_mm, np.concatenate([v.points_mm for v in alone]))
     line = helix()
-    truth, _, _ = occupancy(found.points_mm, 1.0, line[:-1], line[1:], np.full(len(line) - 1, 1.6))
-    return views, found, encoded, truth
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    held = placed.confidence.sum() * placed.spacing_mm**3
+    assert held == pytest.approx(np.pi * 1.6**2 * length, rel=0.15)
+    # True depth: every centre is on the helix, whichever view it is from.
+    off = cKDTree(line).query(placed.points_mm)[0]
+    assert np.percentile(off, 95) < 1.6 + 2 * placed.spacing_mm
 
 
-def test_true_depths_decide_and_wrong_ones_by_centimetres_still_help(hull):
-    from gcar_deploy.predict.thinning import thin_hull
-
-    views, found, encoded, truth = hull
-    without = dice(thin_hull(found, encoded).confidence, truth)
-    merged = merge_views(true_centers(views), found, encoded)
-    assert merged.source == "single" and len(merged) == len(found)
-    assert dice(merged.confidence, truth) > without + 0.3
-    noisy = true_centers(views, 5.0, np.random.default_rng(0))
-    rough = merge_views(noisy, found, encoded)
-    assert dice(rough.confidence, truth) > without
-
-
-def test_agreement_is_one_at_the_predicted_depth_and_a_quarter_at_the_scale(hull):
-    views, _, _, _ = hull
-    center = true_centers(views)[0]
-    np.testing.assert_allclose(agreement(center, center.points_mm), 1.0, atol=1e-9)
-    source = center.picture.carm.source_mm
-    ray = (center.points_mm - source) / np.linalg.norm(center.points_mm - source, axis=1)[:, None]
-    moved = center.points_mm + DEPTH_SCALE_PIXELS * center.picture.pixel_mm * ray
-    np.testing.assert_allclose(agreement(center, moved), 0.25, atol=1e-9)
+def test_a_centre_lies_on_its_true_ray_at_its_depth():
+    """Closed form: source + distance times the unit ray through the cell, plus the offset."""
+    carm, path = scene(((-30, -20), (45, 25)))[0]
+    picture = net_picture(carm, path, 128)
+    answer = np.zeros((4, 64, 64))
+    answer[0] = 0.6
+    answer[1:] = np.array([1.0, -2.0, 0.5])[:, None, None]
+    found = decode(answer, picture, 2)
+    t = np.linalg.norm(picture.carm.source_mm) + 0.1 * 160 * picture.pixel_mm
+    np.testing.assert_allclose(found.ray_mm, t)
+    u, v, w = picture.carm.axes
+    shift = picture.pixel_mm * (1.0 * u - 2.0 * v + 0.5 * w)
+    on_ray = found.points_mm - shift
+    np.testing.assert_allclose(np.linalg.norm(on_ray - picture.carm.source_mm, axis=1), t)
+    pixels, _ = picture.carm.project(on_ray)
+    np.testing.assert_allclose(pixels, found.cell[:, ::-1] * 2 + 0.5, atol=1e-9)
 
 
-def test_a_view_that_says_nothing_changes_nothing(hull):
-    views, found, _, _ = hull
-    center = true_centers(views)[0]
-    none = dataclasses.replace(
-        center, points_mm=np.zeros((0, 3)), ray_mm=np.zeros(0), cell=np.zeros((0, 2), int)
-    )
-    np.testing.assert_array_equal(agreement(none, found.points_mm), 1.0)
+def test_known_views_are_those_of_the_trained_directions():
+    carms = [c for c, _ in scene(((0, 0), (90, 0), (45, 0), (3, 3), (-174, 6)))]
+    paper = [[0, 0], [90, 0]]
+    assert known_views(carms, paper) == [0, 1, 3]
+    assert known_views(carms, []) == [0, 1, 2, 3, 4]
+    assert known_views(carms[2:3], paper) == []
 
 
 def test_one_set_of_centres_per_view_of_any_size():
@@ -107,23 +101,32 @@ def test_one_set_of_centres_per_view_of_any_size():
 
 def test_the_result_names_the_predictor(tmp_path):
     angiograms, grid, _ = tiny_case()
-    result = Engine(TINY, options=SINGLE).reconstruct(angiograms, grid)
-    assert result.predictor == "single" and result.model["name"] == "tiny-single"
+    result = Engine(TINY, options=PAPER).reconstruct(angiograms, grid)
+    assert result.predictor == "paper" and result.model["name"] == "tiny-paper"
     assert result.status == "degraded"
     assert any("one view at a time" in said for said in result.quality.findings)
     # The kind is read off the model where none is asked for.
-    assert Engine(TINY).reconstruct(angiograms, grid).predictor == "single"
+    unasked = dataclasses.replace(PAPER, predict=PredictOptions())
+    assert Engine(TINY, options=unasked).reconstruct(angiograms, grid).predictor == "paper"
+
+
+def test_from_the_models_centres_through_the_optimisation_to_a_tree():
+    angiograms, grid, _ = tiny_case()
+    result = Engine(TINY, options=PAPER).reconstruct(angiograms, grid)
+    assert (result.predictor, result.refiner, result.status) == ("paper", "paper", "degraded")
+    assert result.losses[-1] < 0.2 * result.losses[0]
+    assert result.tree.branches and len(result.gaussians) > 50
 
 
 def test_a_model_of_the_other_kind_is_refused():
     multi = TINY.with_name("tiny.onnx")
-    with pytest.raises(ModelError, match="is of kind multi, not single"):
-        Engine(multi, options=SINGLE)
-    with pytest.raises(ModelError, match="is of kind single, not multi"):
+    with pytest.raises(ModelError, match="is of kind multi, not paper"):
+        Engine(multi, options=PAPER)
+    with pytest.raises(ModelError, match="is of kind paper, not multi"):
         Engine(TINY, options=RunOptions(predict=PredictOptions(predictor="multi")))
 
 
-@pytest.mark.parametrize("wanted", ["auto", "multi", "single"])
+@pytest.mark.parametrize("wanted", ["auto", "multi", "paper"])
 def test_without_a_model_the_hull_is_thinned_and_the_result_says_so(wanted, monkeypatch, tmp_path):
     monkeypatch.setattr("gcar_deploy.models.spec.resources.files", lambda _: tmp_path)
     angiograms, grid, _ = tiny_case()
@@ -131,7 +134,7 @@ def test_without_a_model_the_hull_is_thinned_and_the_result_says_so(wanted, monk
     result = Engine(options=options).reconstruct(angiograms, grid)
     assert result.predictor == "hull" and result.model is None
     assert result.status == "degraded" and "no model was used" in " ".join(result.quality.findings)
-    name = "gcp-single" if wanted == "single" else "gcp-multi"
+    name = "gcp-paper" if wanted == "paper" else "gcp-multi"
     assert f"{name}.onnx is not installed" in " ".join(result.notes)
 
 
@@ -179,7 +182,7 @@ class _Broken:
     """A session whose weights went wrong."""
 
     def run(self, names, feed, options):
-        return [np.full((1, 4, 8, 8), np.nan, np.float32)]
+        return [np.full((1, 4, 32, 32), np.nan, np.float32)]
 
 
 def test_values_that_are_not_finite_are_an_error():

@@ -1,4 +1,4 @@
-"""Train the paper's single-view centre predictor, in pieces of any length.
+"""Train the paper's Gaussian centre predictor, in pieces of any length.
 
 Pictures of step k are a function of (seed, k), the learning rate and the Chamfer weight of the
 step: a run that was stopped goes on to the bit (see ``run_folder``).
@@ -20,10 +20,9 @@ import torch
 from gcar_deploy.predict.center_map import DEPTH_PIXELS, decode
 from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training import losses
-from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
+from gcar_export.training.paper_dataset import POSES, VIEWS, TrainingPicture, training_pictures
 from gcar_export.training.run_folder import ProgressLine, RunFolder
-from gcar_export.training.single_dataset import SCENES, VIEWS, TrainingPicture, training_pictures
 
 #: trees with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -32,52 +31,56 @@ _UNIT_PIXELS = 64.0
 
 
 @dataclasses.dataclass(frozen=True)
-class SingleOptions:
+class PaperTraining:
     """Optimiser settings; the rate warms up, stays, then falls linearly to zero."""
 
     seed: int = 1
-    steps: int = 1_600
-    decay_steps: int = 800
+    steps: int = 4_500
+    decay_steps: int = 3_825
     trees: int = 4
-    warmup_steps: int = 100
-    learning_rate: float = 1e-3
+    warmup_steps: int = 200
+    learning_rate: float = 1.5e-3
     weight_decay: float = 1e-4
     clip: float = 10.0
     #: see ``losses.chamfer_weight``; the paper's 20,000 scaled to the length of the run
     chamfer_schedule: str = "clamp"
-    chamfer_start: int = 1_000
+    chamfer_start: int = 1_800
+    #: see ``losses.depth_loss``
+    depth_terms: str = "mean"
+    #: views usual in practice in place of the paper's two
+    usual: bool = False
     #: clDice on a cube of so many voxels, of so many of a step's pictures
     cldice_voxels: int = 32
     cldice_pictures: int = 1
     cldice_iterations: int = 1
     validation_trees: int = 20
-    save_every: int = 100
+    save_every: int = 250
     device: str = "cpu"
     #: forward pass in bfloat16; losses stay in float32
-    bf16: bool = False
+    bf16: bool = True
     compiled: bool = False
 
 
 PRESETS = {
-    "cpu": SingleOptions(),
-    "gpu": SingleOptions(
+    "cpu": PaperTraining(),
+    "gpu": PaperTraining(
         steps=100_000, decay_steps=40_000, trees=16, chamfer_start=losses.PAPER_START,
         cldice_voxels=128, cldice_pictures=8, cldice_iterations=4, save_every=2_000,
         device="cuda", bf16=True, compiled=True,
     ),
-    "tiny": SingleOptions(
+    "tiny": PaperTraining(
         steps=4, decay_steps=2, trees=1, warmup_steps=1, chamfer_start=1, cldice_voxels=16,
         validation_trees=1, save_every=2,
     ),
 }  # fmt: skip
 CONFIGS = {
-    "cpu": UNetConfig(width=(8, 16, 32, 64, 128, 160), pose=True),
+    "cpu": UNetConfig(width=(8, 16, 32, 96, 128, 160), pose=True),
     "gpu": UNetConfig(width=(16, 32, 64, 96, 128, 160), pose=True),
     "tiny": UNetConfig(pixels=64, alpha=4, width=(4, 4)),
 }
 
 
-def learning_rate(options: SingleOptions, step: int) -> float:
+def learning_rate(options: PaperTraining, step: int) -> float:
     """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
     up = min(1.0, (step + 1) / options.warmup_steps)
     down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
@@ -93,7 +96,7 @@ class Batch:
     pictures : (b, 1, n, n); depth, known, cells : (b, m, m); rays : (b, m, m, 3)
         Rays in the axes of each view (column, row, source to detector).
     middle : (b,) distance of source and isocentre, and source : (b, 3), both in units of 64 pixels
-    centerline : per picture (k, 3), units of 64 pixels, axes of the view
+    points : per picture (k, 3) of the true lumen, units of 64 pixels, axes of the view
     axes : (b, 3, 3) axes of the views, rows
     """
 
@@ -103,7 +106,7 @@ class Batch:
     cells: torch.Tensor
     rays: torch.Tensor
     source: torch.Tensor
-    centerline: list[torch.Tensor]
+    points: list[torch.Tensor]
     axes: torch.Tensor
 
     @staticmethod
@@ -122,8 +125,8 @@ class Batch:
             cells=stack([p.picture.cells(alpha) for p in drawn], bool),
             rays=stack([p.picture.rays(alpha) @ a.T for p, a in zip(drawn, axes, strict=True)]),
             source=stack([a @ p.picture.carm.source_mm / u for p, a, u in zip(drawn, axes, units)]),  # noqa: B905
-            centerline=[
-                torch.from_numpy((p.centerline_mm @ a.T / u).astype(np.float32)).to(device)
+            points=[
+                torch.from_numpy((p.points_mm @ a.T / u).astype(np.float32)).to(device)
                 for p, a, u in zip(drawn, axes, units, strict=True)
             ],
             axes=stack(axes),
@@ -138,7 +141,7 @@ class Batch:
 
 
 def batch_loss(
-    out: torch.Tensor, batch: Batch, step: int, options: SingleOptions
+    out: torch.Tensor, batch: Batch, step: int, options: PaperTraining
 ) -> tuple[torch.Tensor, dict[str, int]]:
     """Mean over pictures of the paper's loss; and how many pictures each term had to leave out."""
     gamma1 = losses.chamfer_weight(step, options.chamfer_start, options.chamfer_schedule)
@@ -146,13 +149,13 @@ def batch_loss(
     total = out.new_zeros(())
     n = len(out)
     for k in range(n):
-        depth = losses.depth_loss(out[k, 0], batch.depth[k], batch.known[k])
+        depth = losses.depth_loss(out[k, 0], batch.depth[k], batch.known[k], options.depth_terms)
         if depth is None:
             left_out["depth"] += 1
         else:
-            total = total + losses.GAMMA_DEPTH * losses.DEPTH_SCALE * depth / n
+            total = total + losses.depth_weight(options.depth_terms) * depth / n
         if gamma1 > 0:
-            distance = losses.chamfer(batch.centers(out, k), batch.centerline[k])
+            distance = losses.chamfer(batch.centers(out, k), batch.points[k])
             if distance is None:
                 left_out["chamfer"] += 1
             else:
@@ -163,7 +166,7 @@ def batch_loss(
     chosen = [(step + j) % n for j in range(wanted)]
     for k in chosen:
         made = losses.splat(batch.centers(out, k), options.cldice_voxels)
-        true = losses.splat(batch.centerline[k], options.cldice_voxels)
+        true = losses.splat(batch.points[k], options.cldice_voxels)
         overlap = losses.skeleton_dice_loss(made, true, options.cldice_iterations)
         total = total + losses.GAMMA_CLDICE * overlap / len(chosen)
     return total, left_out
@@ -202,7 +205,7 @@ def validate(
 
 def train(
     out: Path,
-    options: SingleOptions,
+    options: PaperTraining,
     config: UNetConfig,
     *,
     until: float | None = None,
@@ -216,8 +219,7 @@ def train(
     UsageError
         ``out`` holds a run of another network, size, seed or set of labels.
     """
-    scenes = SCENES
-    run = RunFolder(out, _manifest(options, config, scenes, label_hashes or {}))
+    run = RunFolder(out, _manifest(options, config, label_hashes or {}))
     torch.manual_seed(options.seed)
     net = UNetPredictor(config).to(options.device)
     # The stubs do not know this keyword of a module.
@@ -229,7 +231,7 @@ def train(
     held_out = [
         p
         for i in range(options.validation_trees)
-        for p in training_pictures(VALIDATION_SEED, i, config, scenes)
+        for p in training_pictures(VALIDATION_SEED, i * POSES, config, usual=options.usual)
     ]
     forward = torch.compile(net) if options.compiled else net
     line = ProgressLine(step, options.steps, options.trees * VIEWS, "pictures")
@@ -241,7 +243,7 @@ def train(
             p
             for j in range(options.trees)
             for p in training_pictures(
-                options.seed, step * options.trees + j, config, scenes, labels
+                options.seed, step * options.trees + j, config, labels, options.usual
             )
         ]
         batch = Batch.of(drawn, config.alpha, options.device)
@@ -271,21 +273,19 @@ def train(
     run.save(net, optimiser, step)
 
 
-def _precision(options: SingleOptions) -> contextlib.AbstractContextManager[Any]:
+def _precision(options: PaperTraining) -> contextlib.AbstractContextManager[Any]:
     kind = torch.device(options.device).type
     return torch.autocast(kind, torch.bfloat16, enabled=options.bf16)
 
 
 def _manifest(
-    options: SingleOptions, config: UNetConfig, scenes: SceneOptions,
-    label_hashes: Mapping[str, str],
-) -> dict[str, Any]:  # fmt: skip
+    options: PaperTraining, config: UNetConfig, label_hashes: Mapping[str, str]
+) -> dict[str, Any]:
     return {
         "network": "unet",
         "config": dataclasses.asdict(config),
         "seed": options.seed,
         "options": dataclasses.asdict(options),
-        "scenes": dataclasses.asdict(scenes),
         "labels": dict(label_hashes),
         "data": "generated trees (gcar_export.scenes.trees): tree step * trees + j of the seed"
         if not label_hashes
