@@ -35,7 +35,7 @@ TABLE_1: Mapping[str, str | None] = {
 }  # fmt: skip
 TABLE_2: Mapping[str, str | None] = {
     "3dgr-fbp": "3DGR-FBP", "3dgr-fbp-l2": None, "3dgr-gcp-l2": "3DGR-GCP, L2 alone",
-    "3dgr-gcp": "3DGR-GCP", "3dgr-gcp-short": None, "ours": None,
+    "3dgr-gcp": "3DGR-GCP", "3dgr-gcp-short": None, "3dgr-true-depth": None, "ours": None,
 }  # fmt: skip
 
 
@@ -44,7 +44,7 @@ NAMES: Mapping[str, str] = {
     "fdk": "FBP (FDK)", "nerp": "NeRP, fitted on hull voxels", "ours": "gcar as it comes",
     "3dgr-gcp": "3DGR-GCP (as printed)", "3dgr-gcp-l2": "3DGR-GCP (as printed), L2 alone",
     "3dgr-fbp": "3DGR-FBP (as printed)", "3dgr-fbp-l2": "3DGR-FBP (as printed), L2 alone",
-    "3dgr-gcp-short": "3DGR-GCP, short budget",
+    "3dgr-gcp-short": "3DGR-GCP, short budget", "3dgr-true-depth": "3DGR from true depth",
 }  # fmt: skip
 
 

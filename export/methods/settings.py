@@ -84,14 +84,17 @@ RUNTIME_ROWS: Mapping[str, RuntimeRow] = {
 }  # fmt: skip
 #: rows that know nothing of the runtime but its geometry.
 BASELINES = ("fdk", "sart", "visual_hull", "nerp")
-#: the paper's refinement from an FBP start ("3DGR-FBP"); how each row differs from as printed.
-FBP_ROWS: Mapping[str, PaperOptions] = {
+#: centres at true depth, an upper bound for a predictor of single views.
+TRUE_DEPTH = "3dgr-true-depth"
+#: the paper's refinement from other starts, FBP ("3DGR-FBP") or true depth, and its settings.
+START_ROWS: Mapping[str, PaperOptions] = {
     "3dgr-fbp": PRINTED,
     "3dgr-fbp-l2": dataclasses.replace(PRINTED, alpha=1.0),
     "3dgr-fbp-released": RELEASED,
+    TRUE_DEPTH: PRINTED,
     "3dgr-fbp-short": dataclasses.replace(PRINTED, steps=PaperOptions().steps),
 }
-METHODS = (*RUNTIME_ROWS, *FBP_ROWS, *BASELINES)
+METHODS = (*RUNTIME_ROWS, *START_ROWS, *BASELINES)
 #: options of the runtime that a simulated case depends on (not: how files are read).
 _STAGES = (
     "imaging", "pose", "candidates", "predict", "refine", "quality",
@@ -119,6 +122,7 @@ DESCRIPTIONS: Mapping[str, str] = {
     "3dgr-fbp": "3DGR-FBP (as printed): FDK start, the paper's refinement",
     "3dgr-fbp-l2": "3DGR-FBP (as printed), L2 alone",
     "3dgr-fbp-released": "3DGR-FBP with the settings of the released code",
+    TRUE_DEPTH: "the same from centres at true depth: what a perfect predictor would give",
     "3dgr-fbp-short": "3DGR-FBP, short budget (150 iterations)",
     "fdk": "filtered backprojection (FDK, itk-rtk)",
     "sart": "SART, non-negative (itk-rtk)",
@@ -181,9 +185,9 @@ class MethodSettings:
             ),
         )
 
-    def fbp_paper_options(self, method: str) -> PaperOptions:
-        """Return the paper's refinement from an FBP start, for a method of ``FBP_ROWS``."""
-        return self._limited(FBP_ROWS[method])
+    def started_options(self, method: str) -> PaperOptions:
+        """Return the paper's refinement for a method of ``START_ROWS``."""
+        return self._limited(START_ROWS[method])
 
     def _limited(self, paper: PaperOptions) -> PaperOptions:
         steps = min(paper.steps, self.paper_steps or paper.steps)
@@ -199,11 +203,11 @@ class MethodSettings:
                 "grey_masks": RUNTIME_ROWS[method].grey_masks,
                 "models": _model_hashes(options.predict.predictor),
             }
-        elif method in FBP_ROWS:
+        elif method in START_ROWS:
             out = {
                 "fdk": dataclasses.asdict(self.fdk),
                 "gaussians": self.fbp_gaussians,
-                "paper": dataclasses.asdict(self.fbp_paper_options(method)),
+                "paper": dataclasses.asdict(self.started_options(method)),
             }
         elif method == "visual_hull":
             out = {"path_mm": self.hull_path_mm}

@@ -21,9 +21,10 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Image, Points, Volume
 from gcar_export.methods.settings import (
-    FBP_ROWS,
     METHODS,
     RUNTIME_ROWS,
+    START_ROWS,
+    TRUE_DEPTH,
     MethodSettings,
     RuntimeRow,
 )
@@ -76,8 +77,8 @@ def solve(case: Case, method: str, settings: MethodSettings | None = None) -> So
             return _runtime(case, options, RUNTIME_ROWS[method])
         _warm_up(method)
         clock = _Clock()
-        if method in FBP_ROWS:
-            volume, gaussians, sentence = _fbp_paper(case, method, settings)
+        if method in START_ROWS:
+            volume, gaussians, sentence = _started(case, method, settings)
         else:
             volume, gaussians, sentence = _baseline(case, method, settings), None, ""
         return Solved(
@@ -264,18 +265,22 @@ def _baseline(case: Case, method: str, settings: MethodSettings) -> Volume:
     return fdk(*given, settings.fdk)
 
 
-def _fbp_paper(case: Case, method: str, settings: MethodSettings) -> tuple[Volume, int, str]:
+def _started(case: Case, method: str, settings: MethodSettings) -> tuple[Volume, int, str]:
     from gcar_deploy.gaussians.paper import refine_paper
     from gcar_deploy.gaussians.voxelize import voxelize
     from gcar_deploy.imaging.extract import extract_vessels
     from gcar_export.methods.fbp_gaussians import fbp_centers
     from gcar_export.methods.fdk import fdk
+    from gcar_export.methods.true_depth import true_depth_centers
 
     given = path_lengths(case), case.scene_carms
-    start = fdk(*given, case.grid, settings.fdk)
-    centers = fbp_centers(start, case.grid, *given, settings.fbp_gaussians)
+    if method == TRUE_DEPTH:
+        centers = true_depth_centers(case, given[0])
+    else:
+        start = fdk(*given, case.grid, settings.fdk)
+        centers = fbp_centers(start, case.grid, *given, settings.fbp_gaussians)
     views = [extract_vessels(a, settings.run.imaging) for a in case.angiograms()]
-    options = settings.fbp_paper_options(method)
+    options = settings.started_options(method)
     fit = refine_paper(centers, views, options)
     volume = np.clip(voxelize(fit.gaussians, case.grid), 0.0, 1.0)
     return volume, len(fit.gaussians), f"{fit.steps} of at most {options.steps} steps"

@@ -15,14 +15,14 @@ from gcar_deploy.errors import UsageError
 from gcar_export.evaluate.evaluate import EvaluateOptions, evaluate
 from gcar_export.evaluate.plots import figure, style
 from gcar_export.evaluate.tables import grouped, summarise
-from gcar_export.methods.settings import FBP_ROWS, RUNTIME_ROWS, MethodSettings
+from gcar_export.methods.settings import RUNTIME_ROWS, START_ROWS, MethodSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: methods with a number of steps.
 ITERATIVE = (
-    "nerp", *FBP_ROWS, *(name for name, row in RUNTIME_ROWS.items() if row.refiner == "paper"),
+    "nerp", *START_ROWS, *(name for name, row in RUNTIME_ROWS.items() if row.refiner == "paper"),
 )  # fmt: skip
 _HEAD = ("protocol", "case", "method", "steps", "dsc", "best_dsc", "seconds")
 

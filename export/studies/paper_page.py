@@ -17,12 +17,12 @@ from gcar_export.evaluate import paper_tables
 from gcar_export.evaluate.evaluate import EvaluateOptions, evaluate
 from gcar_export.evaluate.plots import bars_over_views
 from gcar_export.evaluate.tables import grouped
-from gcar_export.methods.settings import DESCRIPTIONS, MethodSettings
+from gcar_export.methods.settings import DESCRIPTIONS, TRUE_DEPTH, MethodSettings
 
 #: what is run, the most important first: methods and numbers of views
 SWEEPS: Sequence[tuple[tuple[str, ...], tuple[int, ...]]] = (
     (("3dgr-gcp", "3dgr-fbp", "3dgr-gcp-l2"), (2,)),
-    (("ours", "fdk"), (2,)),
+    (("ours", "fdk", TRUE_DEPTH), (2,)),
     (("nerp",), (2,)),
     (("3dgr-gcp", "ours", "fdk", "nerp"), (4, 8, 16)),
     (("3dgr-fbp-l2", "3dgr-gcp-short", "3dgr-fbp-short", "3dgr-fbp-released"), (2,)),
