@@ -22,16 +22,16 @@ _CASES = click.option("--cases", default="", help="Only these cases, comma-separ
 )
 @click.option(
     "--models",
-    default="multi,single",
+    default="multi,paper",
     show_default=True,
-    help="Comma-separated: multi, single (the shipped ones), or paths.",
+    help="Comma-separated: multi, paper (the shipped ones), or paths.",
 )
 @_CASES
 @click.option("--no-cost", is_flag=True, help="Leave time and memory away.")
 def centers_table(data: Path, protocol: str, models: str, cases: str, no_cost: bool) -> None:
     """Compare predicted centres with the truth: within 1.5 voxels, both ways; time and memory.
 
-    Example: gcar-export centers-table --data data --protocol clinical --models multi,single
+    Example: gcar-export centers-table --data data --protocol clinical --models multi,paper
     """
     from gcar_export.studies import centers_table as centers
 

@@ -179,7 +179,7 @@ def _picture(
 def _worn(rng: np.random.Generator, path: Image, pixel_mm: float) -> Image:
     """Blur by part of a pixel, contrast that wanders by a tenth: voxelised trees look so."""
     wave = cv2.GaussianBlur(rng.normal(size=path.shape).astype(np.float32), (0, 0), 2.0)
-    wave *= rng.uniform(0, 0.2) / max(float(wave.std()), 1e-6)
+    wave = wave * (rng.uniform(0, 0.2) / max(float(wave.std()), 1e-6))
     out = cv2.GaussianBlur(path * np.exp(wave), (0, 0), rng.uniform(0.2, 0.6))
     out[out < 0.05 * pixel_mm] = 0.0
     return np.asarray(out, dtype=np.float32)
