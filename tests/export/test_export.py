@@ -14,7 +14,7 @@ from gcar_export.shipping.export_onnx import load_checkpoint
 from gcar_export.shipping.parity import Parity, accept, export_checked, parity
 from gcar_export.shipping.quantize import quantize_checked
 from gcar_export.shipping.task_check import task_measure, torch_predictor
-from gcar_export.shipping.tiny_model import TINY, TINY_SINGLE, write_tiny_checkpoint
+from gcar_export.shipping.tiny_model import TINY, TINY_PAPER, write_tiny_checkpoint
 from gcar_export.shipping.verify import verify_model
 from gcar_export.training.networks.sparse import SparseConfig
 from gcar_export.training.networks.unet import UNetConfig
@@ -34,7 +34,7 @@ def exported(request, tmp_path_factory):
 def test_a_checkpoint_of_another_size_goes_through(exported):
     checkpoint, model, found = exported
     config = load_checkpoint(checkpoint).config
-    assert config in (TINY, TINY_SINGLE) and config not in (SparseConfig(), UNetConfig())
+    assert config in (TINY, TINY_PAPER) and config not in (SparseConfig(), UNetConfig())
     assert found.inputs == 9 and found.worst < 1e-4 and found.decisions_equal > 0.9999
     assert found.task_torch == pytest.approx(found.task_runtime, abs=1e-3)
     spec = read_predictor(model).spec
