@@ -55,6 +55,16 @@ def stroke(page, view, places):
     page.mouse.up()
 
 
+def nothing_serious(page):
+    """Let axe-core look at the page as it is."""
+    # The page's policy holds for scripts that it loads; the browser's own door is another.
+    page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
+    found = page.evaluate("axe.run()")
+    bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
+    told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in bad]
+    assert found["passes"] and not told, told
+
+
 def until(page, holds):
     """Wait; the page's policy forbids Playwright's own way, which evaluates text."""
     end = time.monotonic() + 240
@@ -176,6 +186,7 @@ def test_phantom_runs_dropped_on_the_page_go_the_whole_way(serve, browse, engine
     assert finished(page) in ("ok", "degraded")
     strips = page.locator("#frames .strip")
     until(page, lambda: strips.count() == 2 and strips.first.locator("button").count() == 9)
+    nothing_serious(page)
     # Where the upper branch leaves the main tube.
     marks = [np.array(told["pixels_col_row"][run][2]) for run in ("IM7", "IM8")]
     shorter, order = way_of_a_case(page, cases / "case", [(30, 470), (60, 480), (90, 490)], marks)
@@ -193,6 +204,7 @@ def test_a_stated_alternative_is_shown_and_picked(serve, browse):
     rows, stated = page.locator("#lesions tbody tr"), page.locator("#alternatives li")
     before, texts = rows.count(), stated.all_inner_texts()
     assert "a ghost with probability" in texts[0]
+    nothing_serious(page)
     tree = page.locator(".view canvas").last
     unmarked = tree.screenshot()
     page.click("#alternatives li:first-child button:has-text('Show')")
@@ -269,12 +281,7 @@ def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width):
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     page.click("#geometry summary")
     page.click("#files-of summary")
-    # The page's policy holds for scripts that it loads; the browser's own door is another.
-    page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
-    found = page.evaluate("axe.run()")
-    bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
-    told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in bad]
-    assert found["passes"] and not told, told
+    nothing_serious(page)
 
 
 def test_one_printed_page(serve, browse):
