@@ -97,15 +97,15 @@ def flow_rows(
 
 def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
     """Pd/Pa of a tree behind the true lesion, against that of the truth."""
-    place = _behind(case)
+    place, middle = _behind(case), _middle(case)
     truth = joined_tree(case.vessels)
     usual = Assumption()
-    true = _at(truth, told(truth, usual), place)
+    true = _at(truth, told(truth, usual), place, middle)
     row = FlowRow(
         name=case.name, status=status,
         true_drop_mmhg=np.nan if true is None else (1 - true[0]) * usual.aortic_pressure_mmhg,
     )  # fmt: skip
-    found = _at(tree, told(tree, usual), place)
+    found = _at(tree, told(tree, usual), place, middle)
     if true is None or found is None:
         return row
     rng = np.random.default_rng(seed)
@@ -114,7 +114,7 @@ def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
         velocity_m_s=usual.velocity_m_s
         * float(np.exp(np.log1p(usual.relative_flow_sigma) * rng.standard_normal())),
     )
-    other = _at(truth, told(truth, drawn), place)
+    other = _at(truth, told(truth, drawn), place, middle)
     return dataclasses.replace(
         row,
         drop_mmhg=(1 - found[0]) * usual.aortic_pressure_mmhg,
@@ -214,6 +214,14 @@ def table(rows: Sequence[FlowRow]) -> str:
     ])  # fmt: skip
 
 
+def _middle(case: StenosisCase) -> np.ndarray:
+    """(3,) the middle of the lesion."""
+    vessel = case.vessels[case.lesion.vessel]
+    return np.array([
+        np.interp(case.lesion.middle_mm, vessel.arc_mm, column) for column in vessel.points_mm.T
+    ])  # fmt: skip
+
+
 def _behind(case: StenosisCase) -> np.ndarray:
     """(3,) the place behind the lesion."""
     vessel, lesion = case.vessels[case.lesion.vessel], case.lesion
@@ -222,15 +230,16 @@ def _behind(case: StenosisCase) -> np.ndarray:
 
 
 def _at(
-    tree: Tree, drop: PressureDrop, place: np.ndarray
+    tree: Tree, drop: PressureDrop, place: np.ndarray, middle: np.ndarray
 ) -> tuple[float, float, float, str] | None:
     """Pd/Pa, interval and reason at the point nearest to a place; None where none is near."""
-    best: tuple[float, tuple[float, float, float, str]] | None = None
+    best: tuple[tuple[bool, float], tuple[float, float, float, str]] | None = None
     for branch, vessel in zip(tree.branches, drop.vessels, strict=True):
         gap = np.linalg.norm(branch.points_mm - place, axis=1)
         k = int(np.argmin(gap))
-        width = float(branch.radius_mm[k])
-        # Of several the widest: twigs run beside the vessel for a while.
+        through = np.linalg.norm(branch.points_mm - middle, axis=1).min() <= NEAR_MM
+        width = bool(through), float(branch.radius_mm[k])
+        # Of several the one with the lesion, then the widest: twigs run beside it for a while.
         if gap[k] <= NEAR_MM and np.isfinite(vessel.ratio[k]) and (not best or width > best[0]):
             held = "" if vessel.told[k] else (vessel.withheld or "too wide")
             ratio, low, high = (float(x[k]) for x in (vessel.ratio, vessel.low, vessel.high))

@@ -56,7 +56,7 @@ TILT_SD = 0.07
 SHORT_SINE, OVERLAP_SHARE = 0.5, 0.3
 #: error of a log radius that one view alone shows: another vessel, or an axis that is off, would
 #: not be noticed
-ALONE_SD = 0.2
+ALONE_SD = 0.1
 #: sections where no view knows the log radius better than this are not measured
 UNKNOWN_SD_LOG = 0.25
 #: walk of the log radius along a vessel: scale, 1 / sqrt(mm), Student's degrees of freedom
