@@ -1,7 +1,7 @@
 """Real angiograms with the vessels as an expert drew them: folds, and crops to train on.
 
 A folder holds ``N.png`` with ``N_gt.png``. What an expert draws has no depth and no catheter: the
-chord is that of round vessels as wide as drawn, and nothing is asked of devices.
+chord is that of round vessels as wide as drawn, and of devices is known where none is: on vessels.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class ExpertPicture:
 
     @functools.cached_property
     def labelled(self) -> Labelled:
-        """The picture with what is asked: nothing of devices."""
+        """The picture with what is asked: of devices, that no vessel is one."""
         ones = np.ones_like(self.path_px)
-        layers = [self.mask, ones, self.path_px, 0 * ones, 0 * ones, 0 * ones]
+        layers = [self.mask, ones, self.path_px, 0 * ones, self.mask, 0 * ones]
         scale = NETWORK_SIDE / float(np.sqrt(self.mask.size))
         asked = np.stack(layers).astype(np.float32)
         return Labelled(self.pixels, asked, (scale * ZOOM[0], scale * ZOOM[1]))

@@ -147,7 +147,7 @@ def test_losses_are_least_at_the_truth():
     assert total_loss(both, truths) < 0.1
     assert line_loss(right, line) < 0.01 < 0.95 < line_loss(-right, line)
     assert line_loss(-right, 0 * line) == 0  # nothing to find, nothing lost
-    # Of devices in a real picture nothing is known, so nothing is asked.
+    # Where nothing is known of devices, nothing is asked.
     unknown = torch.stack([truth, weight, chord, 0 * truth, 0 * weight, line], 1)
     torch.testing.assert_close(
         total_loss(torch.stack([right, chord, right], 1), unknown), total_loss(both, unknown)
@@ -269,7 +269,10 @@ def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
         channels, truth = expert_pair(pictures, 1, index)
         assert channels.shape == (3, SIDE, SIDE) and truth.shape == (6, SIDE, SIDE)
         vessel, asked, chord, device, known, _ = truth
-        assert not device.any() and not known.any() and (chord[asked == 0] == 0).all()
+        assert not device.any() and (chord[asked == 0] == 0).all()
+        assert (known <= cv2.dilate(vessel, np.ones((5, 5)))).all() and (known.sum() > 0) == (
+            vessel.sum() > 0
+        )
         inner = (cv2.erode(vessel, np.ones((5, 5))) > 0) & (asked > 0)
         outer = (cv2.dilate(vessel, np.ones((9, 9))) == 0) & (asked > 0)
         if inner.sum() > 200:  # a crop's collimator search may have taken the rest
@@ -282,8 +285,8 @@ def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
 def test_a_step_holds_real_and_generated_pictures(drawn, tmp_path):
     options = dataclasses.replace(TINY, batch=4, real=str(drawn), real_share=0.5, crop=128)
     stream = Stream(options, tmp_path, real_pictures(options))
-    known = [float(stream[k][1][4].sum()) for k in range(4)]
-    assert known[:2] == [0, 0] and min(known[2:]) > 0
+    known = [float(stream[k][1][4].mean()) for k in range(4)]
+    assert max(known[:2]) < 0.5 < min(known[2:])  # of devices, real pictures tell little
     assert stream[0][0].shape == (3, 128, 128) and stream[3][1].shape == (6, 128, 128)
     assert len(list(tmp_path.iterdir())) <= TINY.pictures
 
