@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 
+from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.types import Mask
 
+#: a line of the network's is on a device that lies so near, pixels each way
+_NEAR = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+
 
 def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
-    """Return the mean of both paths, and the mask that the network draws.
+    """Return the mean of both paths, and the mask that the network draws without catheters.
 
     Their errors have little in common: the one follows any line, however faint, and its contrast
     holds all that lies there; the other knows what a vessel looks like, at whatever size. The
     classical paths are first brought to the scale of the network's, which is the better known.
+    A catheter has the contrast of a vessel, so that the network takes many for one; by its course
+    the classical method knows some of them.
 
     Parameters
     ----------
@@ -25,6 +32,8 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
     -------
     VesselImage ; its ``others`` are ``learned`` and ``classic``
     """
+    if classic.catheter is not None and classic.catheter.any():
+        learned = _without(learned, classic.catheter)
     ours, theirs = classic.path_mm.astype(np.float64), learned.path_mm.astype(np.float64)
     both = (ours > 0) & (theirs > 0)
     power = float((ours[both] ** 2).sum())
@@ -35,6 +44,23 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
         others=(learned, classic),
         catheter=_either(classic, learned, learned.mask),
         catheter_mm=max(classic.catheter_mm, learned.catheter_mm),
+    )
+
+
+def _without(view: VesselImage, device: Mask) -> VesselImage:
+    """Cut the lines that lie on a device, as wide as they are."""
+    line = view.skeleton
+    on_it = line & (cv2.dilate(device.astype(np.uint8), _NEAR) > 0)
+    left = line & ~on_it
+    if not on_it.any() or not left.any():
+        return view
+    gone = skel.beside(view.path_mm > 0, line, on_it) & ~skel.beside(view.path_mm > 0, line, left)
+    mask = skel.parts_touching(view.mask & ~gone, left)
+    return dataclasses.replace(
+        view,
+        mask=mask,
+        skeleton=skel.skeletonize(mask),
+        path_mm=np.where(gone, np.float32(0), view.path_mm),
     )
 
 
