@@ -87,6 +87,6 @@ class Assumption:
             f"Assumed: {flow} (SD {self.relative_flow_sigma:.0%}), split by diameter^"
             f"{self.split_exponent:g} (SD of a share {self.split_sigma:.0%}), Pa "
             f"{self.aortic_pressure_mmhg:g} mmHg, rigid round vessels, steady flow. Not measured; "
-            "not a fractional flow reserve. Where a branch is missed or joined wrongly, flow and loss "
-            "at a narrowing may be several times another, outside the interval."
+            "not a fractional flow reserve. Where a branch is missed or joined wrongly, flow and "
+            "loss at a narrowing may be several times another, outside the interval."
         )
