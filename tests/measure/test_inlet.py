@@ -14,7 +14,7 @@ from tests.measure.test_naming import left_tree, mapped
 from tests.tree.shapes import branch, fork, tube
 from tests.tree.test_rooted import shuffled
 
-NARCO = Path(os.environ.get("GCAR_DATA", "")) / "data" / "narco"
+NARCO = Path(os.environ.get("GCAR_DATA", "")) / "narco"
 
 
 def begin_mm(tree):
