@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -14,6 +15,24 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import pytest
 
 from tests import part_times, requirements_plugin
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
+#: a busy machine starts a browser slowly
+PATIENCE_MS = 240_000
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """One browser for all tests of a process: Playwright takes no second one beside it."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if BROWSER is None:
+        pytest.skip("no Chromium")
+    with playwright.sync_playwright() as driver:
+        found = driver.chromium.launch(
+            executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"], timeout=PATIENCE_MS
+        )
+        yield found
+        found.close()
 
 
 def data_dir() -> Path:

@@ -19,6 +19,10 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Mask
+
+#: exact views of which vessels are cut are believed when they ask for a shift up to this, mm
+CUT_SHIFT_MM = 1.0
 
 
 def best_separation(carms: Sequence[CArm]) -> float:
@@ -172,6 +176,8 @@ def check_poses(
     """
     findings = []
     hidden = ": the same move within the plane of the beams would leave no trace"
+    # Exact profiles agree to a part in a hundred, and a cut vessel takes more from one of them.
+    cut = [view.view_id for view in views if view.calibrated and _is_cut(view.mask)]
     for view, (shift, turn) in zip(views, corrections, strict=True):
         if shift > options.good_shift_mm or turn > options.good_turn_deg:
             findings.append(
@@ -179,7 +185,17 @@ def check_poses(
                 f"{turn:.1f} deg to agree (up to {options.good_shift_mm:g} mm and "
                 f"{options.good_turn_deg:g} deg are usual)" + (hidden if len(views) == 2 else "")
             )
+        elif shift > CUT_SHIFT_MM and view.calibrated and cut:
+            findings.append(
+                f"view {view.view_id} had to be moved by {shift:.1f} mm to agree, but vessels run "
+                f"out of view {cut[0]}: what is cut off there misleads the estimate"
+            )
     return findings
+
+
+def _is_cut(mask: Mask) -> bool:
+    """Whether vessels reach the border of their picture."""
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def check_asked(

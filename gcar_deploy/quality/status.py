@@ -23,6 +23,7 @@ from gcar_deploy.quality.gates import best_separation, disagreement_limits, kind
 from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.human_range import check_human_range
 from gcar_deploy.quality.scale import check_scale
+from gcar_deploy.quality.severed import check_severed
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes import footprint, tubes_of
 from gcar_deploy.types import Array, Mask, Scalars
@@ -133,6 +134,7 @@ def judge(
         *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
         *check_human_range(tree), *check_ghosts(ghosts, options.quality),
         *check_anatomy(tree, [view.carm for view in views]), *check_border(tree, views),
+        *check_severed(tree, views),
     ]  # fmt: skip
     lumen = [_lumen(tree, v.carm) for v in views]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)

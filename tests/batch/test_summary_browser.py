@@ -8,14 +8,13 @@ import pytest
 
 from gcar_deploy.batch.summary import summary_html
 from gcar_deploy.batch.work import error_row
-from tests.workbench.conftest import chromium  # noqa: F401 - a fixture
 
 AXE = Path(__file__).parents[1] / "workbench" / "vendor" / "axe.min.js"
 LONG = "a-case-whose-name-is-long-and-has-no-place-to-break-it-anywhere-0001"
 
 
 @pytest.fixture
-def browse(chromium, tmp_path):  # noqa: F811
+def browse(chromium, tmp_path):
     """Call with a width; nothing may be complained of or asked for."""
     rows = [
         {**error_row(name, status, f"why {name}", 0), "length_mm": length, "seconds": seconds}

@@ -95,9 +95,16 @@ MUTANTS = (
     Mutant(
         "loss: the centreline's share and the picture's swapped",
         "gcar_deploy/gaussians/loss.py",
-        "((alpha, valid), (1.0 - alpha, skeleton & valid))",
-        "((1.0 - alpha, valid), (alpha, skeleton & valid))",
+        "np.where(valid, alpha + (1.0 - alpha) * skeleton, 0.0)",
+        "np.where(valid, (1.0 - alpha) + alpha * skeleton, 0.0)",
         ("tests/gaussians/test_paper.py",),
+    ),
+    Mutant(
+        "pose: masks are moved by what overlaps in them",
+        "gcar_deploy/pose/profile_fit.py",
+        "uncovered_mm(fixed, moving, carm) <= most * told_mm",
+        "told_mm <= np.inf",
+        ("tests/pose/test_pairwise.py",),
     ),
     Mutant(
         "hashing: an altered model is loaded",

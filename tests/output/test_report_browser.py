@@ -3,39 +3,23 @@
 from __future__ import annotations
 
 import re
-import shutil
 
 import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm
-
-playwright = pytest.importorskip("playwright.sync_api")
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium")
-#: a busy machine starts a browser slowly
-PATIENCE_MS = 120_000
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(
-            executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"], timeout=PATIENCE_MS
-        )
-        yield found
-        found.close()
+from tests.conftest import PATIENCE_MS
 
 
 @pytest.fixture
-def opened(browser, files, tmp_path):
+def opened(chromium, files, tmp_path):
     """Call with a width (and touch) for the page; at the end its console must be silent."""
     path = tmp_path / "report.html"
     path.write_bytes(files["report.html"])
     complaints, contexts = [], []
 
     def open_page(width=1280, touch=False):
-        context = browser.new_context(
+        context = chromium.new_context(
             viewport={"width": width, "height": 1000}, has_touch=touch, is_mobile=touch
         )
         context.set_default_timeout(PATIENCE_MS)

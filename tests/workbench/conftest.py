@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import shutil
 import socket
 import threading
 from pathlib import Path
@@ -13,12 +12,9 @@ import pytest
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.worker.jobs import JobQueue
-from tests.conftest import data_dir
+from tests.conftest import PATIENCE_MS, data_dir
 
 TOKEN = "a-token-of-the-tests"
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
-#: a busy machine is slow
-PATIENCE_MS = 240_000
 
 
 @pytest.fixture(scope="session")
@@ -57,19 +53,6 @@ def serve(engine, tmp_path):
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
             pass
         queue.close()
-
-
-@pytest.fixture(scope="session")
-def chromium():
-    playwright = pytest.importorskip("playwright.sync_api")
-    if BROWSER is None:
-        pytest.skip("no Chromium")
-    with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(
-            executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"], timeout=PATIENCE_MS
-        )
-        yield found
-        found.close()
 
 
 @pytest.fixture
