@@ -103,9 +103,10 @@ def uncovered_mm(fixed: Mass, moving: Mass, carm: CArm) -> float:
     """
     base = carm.source_mm - fixed.carm.source_mm
     lever = np.linalg.norm(np.cross(fixed.carm.source_mm, carm.source_mm)) / np.linalg.norm(base)
+    axes = plane_axes(fixed.carm, carm)
     covered = []
     for mass, view in ((fixed, fixed.carm), (moving, carm)):
-        at = plane_angles(fixed.carm, carm, view, mass.pixels) * lever / BIN_MM + HALF_BINS
+        at = slices_along(axes, view, mass.pixels)[0] * lever / BIN_MM + HALF_BINS
         # A pixel covers all bins up to half its diagonal from its middle.
         half = np.sqrt(0.5) * view.pixel_at_isocenter_mm / BIN_MM
         low, high = (

@@ -246,8 +246,10 @@ def _estimate(
     )
     marked = gap is not None and gap_after is not None
     better = marked and (gap_after or 0.0) < MIN_GAIN * (gap or 0.0)
-    covered = covers(fixed, moving, carm, uncovered_mm(fixed, moving, moving.carm))
-    if not better and (after > most_left * before or not covered):
+    if not better and (
+        after > most_left * before
+        or not covers(fixed, moving, carm, uncovered_mm(fixed, moving, moving.carm))
+    ):
         # Not clearly better than the geometry as given: leave it alone.
         return given
     x, y, z, primary, secondary = (float(value) for value in start)

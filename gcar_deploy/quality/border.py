@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
-import numpy as np
-
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.quality.nearness import distance_mm
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Array
 
 #: a free end so near to where the picture ends is cut by it, mm at the isocentre
 BORDER_MM = 2.0
@@ -31,7 +28,10 @@ def check_border(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
     """
     grey = [view for view in views if not view.calibrated and view.kind != "mask"]
     free = tree.degrees == 1
-    cut = [free & (_distance_mm(view, tree.nodes_mm) < BORDER_MM) for view in grey]
+    cut = [
+        free & (distance_mm(view, tree.nodes_mm, ~view.valid, beyond=True) < BORDER_MM)
+        for view in grey
+    ]
     for number, branch in enumerate(tree.branches, start=1):
         if branch.length_mm < LEAST_MM:
             continue
@@ -42,16 +42,3 @@ def check_border(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
                     "vessel that is cut there?"
                 ]
     return []
-
-
-def _distance_mm(view: VesselImage, points_mm: Array) -> Array:
-    """(n,) distance of points from where the picture ends, mm at the isocentre; 0 outside."""
-    inside = np.pad(view.valid.astype(np.uint8), 1)
-    away = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    pixels = np.rint(np.nan_to_num(view.carm.project(points_mm)[0], nan=-9.0)).astype(np.int64) + 1
-    column, row = pixels[:, 0], pixels[:, 1]
-    rows, columns = inside.shape
-    seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    found = away[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-    out: Array = np.where(seen, found, 0.0) * view.carm.pixel_at_isocenter_mm
-    return out
