@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import json
@@ -178,7 +177,8 @@ class Reconstruction:
 
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
-        return copy.deepcopy(self._summary)
+        copied: dict[str, Any] = json.loads(json.dumps(self._summary))
+        return copied
 
     def to_json(self) -> str:
         """``summary`` as strict JSON text."""

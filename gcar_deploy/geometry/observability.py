@@ -98,23 +98,37 @@ def curve_information(carm: CArm, points_mm: Points, tangents: Points) -> Array:
     A view measures only the component m = unit(d x T) of a displacement; sliding along the
     vessel leaves the picture as it is.
     """
-    rays = points_mm - carm.source_mm
-    depth = np.linalg.norm(rays, axis=1)
-    across = np.cross(rays / depth[:, None], tangents)
-    sine = np.linalg.norm(across, axis=1)
+    focal_px = math.sqrt(math.prod(carm.focal_px))
+    return information_from(carm.source_mm, focal_px, points_mm, tangents)
+
+
+def information_from(
+    sources_mm: Points, focal_px: float, points_mm: Points, tangents: Points
+) -> Array:
+    """(..., n, 3, 3) ``curve_information`` of views from (..., 3) sources, all of one focal length.
+
+    Parameters
+    ----------
+    sources_mm : (..., 3) mm LPS
+    focal_px : float, geometric mean of both axes, pixels
+    points_mm, tangents : (n, 3) mm LPS, unit vectors
+    """
+    rays = points_mm - sources_mm[..., None, :]
+    depth = np.linalg.norm(rays, axis=-1)
+    across = np.cross(rays / depth[..., None], tangents)
+    sine = np.linalg.norm(across, axis=-1)
     seen = sine > math.sin(math.radians(ALONG_BEAM_DEG))
-    m = across / np.maximum(sine, 1e-12)[:, None]
-    mm_per_px = depth / math.sqrt(math.prod(carm.focal_px))
-    weight = seen / mm_per_px**2
-    out: Array = weight[:, None, None] * m[:, :, None] * m[:, None, :]
+    m = across / np.maximum(sine, 1e-12)[..., None]
+    weight = seen / (depth / focal_px) ** 2
+    out: Array = weight[..., None, None] * m[..., :, None] * m[..., None, :]
     return out
 
 
 def worst_across(information: Array) -> Scalars:
-    """(n,) standard deviation in the worse direction across a vessel, mm; see ``curve_sigmas``."""
+    """(...) standard deviation in the worse direction across a vessel, mm; see ``curve_sigmas``."""
     # Only the plane across the vessel counts: along T the information is nil by construction.
     values = np.linalg.eigvalsh(information)
-    low, high = values[:, 1], values[:, 2]
+    low, high = values[..., 1], values[..., 2]
     with np.errstate(divide="ignore"):
         out: Scalars = np.where(
             low > RELATIVE_CUTOFF * high, 1.0 / np.sqrt(np.maximum(low, 1e-300)), np.inf

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.observability import curve_information, worst_across
+from gcar_deploy.geometry.observability import curve_information, information_from, worst_across
 from gcar_deploy.measure.lumen import hidden_share
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array
@@ -62,14 +62,12 @@ def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
 
     known = sum(curve_information(carm, points, tangents) for carm in carms)
 
-    def mean_sigma(information: Array) -> float:
-        return float(np.minimum(worst_across(information), WORST_MM).mean())
+    def mean_sigma(information: Array) -> Array:
+        found: Array = np.minimum(worst_across(information), WORST_MM).mean(axis=-1)
+        return found
 
-    best, least = None, np.inf
-    for primary, secondary in itertools.product(PRIMARY_DEG, SECONDARY_DEG):
-        if np.hypot(primary / ELLIPSE_DEG[0], secondary / ELLIPSE_DEG[1]) > 1:
-            continue
-        carm = CArm(
+    looks = [
+        CArm(
             primary_angle_deg=primary,
             secondary_angle_deg=secondary,
             sod_mm=model.sod_mm,
@@ -78,16 +76,19 @@ def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
             columns=model.columns,
             pixel_spacing_mm=model.pixel_spacing_mm,
         )
-        sigma = mean_sigma(known + curve_information(carm, points, tangents))
-        if sigma < least:
-            best, least = carm, sigma
-    if best is None:
-        return None
+        for primary, secondary in itertools.product(PRIMARY_DEG, SECONDARY_DEG)
+        if np.hypot(primary / ELLIPSE_DEG[0], secondary / ELLIPSE_DEG[1]) <= 1
+    ]
+    sources = np.stack([carm.source_mm for carm in looks])
+    focal_px = float(np.sqrt(np.prod(looks[0].focal_px)))
+    sigma = mean_sigma(known + information_from(sources, focal_px, points, tangents))
+    k = int(np.argmin(sigma))
+    best = looks[k]
     return FurtherView(
         primary_angle_deg=best.primary_angle_deg,
         secondary_angle_deg=best.secondary_angle_deg,
         name=best.clinical_name(),
-        sigma_before_mm=mean_sigma(np.asarray(known)),
-        sigma_after_mm=least,
+        sigma_before_mm=float(mean_sigma(np.asarray(known))),
+        sigma_after_mm=float(sigma[k]),
         foreshortening=hidden_share(tree, best) or 0.0,
     )

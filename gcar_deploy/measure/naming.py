@@ -167,6 +167,7 @@ def readings(tree: Tree, own: Array) -> list[Reading]:
     for root in ends[:MOST_ROOTS]:
         ways = [w for w in routes_from(tree, root) if w.length_mm >= LEAST_WAY_MM]
         calibre = float(np.log(radii[root] / radii[ends[0]]))
+        reach = _Reach.of(ways)
         # A lone line has no side branch to be told by.
         if len(own) > 2:
             out += [_right(way, ways, calibre, whole) for way in _beginnings(ways)]
@@ -174,7 +175,7 @@ def readings(tree: Tree, own: Array) -> list[Reading]:
             reading
             for a in ways
             for c in ways
-            if a is not c and (reading := _left(a, c, ways, calibre, whole)) is not None
+            if a is not c and (reading := _left(a, c, reach, calibre, whole)) is not None
         ]
     return [reading for reading in out if possible(reading.side, reading.figures)]
 
@@ -229,7 +230,25 @@ def _beginnings(ways: list[Route]) -> list[Route]:
     return [found[key] for key in sorted(found)]
 
 
-def _left(a: Route, c: Route, ways: list[Route], calibre: float, whole: float) -> Reading | None:
+@dataclasses.dataclass(frozen=True)
+class _Reach:
+    """How far any way from one ostium reaches: forward and down, back, and along itself, mm."""
+
+    to_apex_mm: float
+    to_back_mm: float
+    longest_mm: float
+
+    @staticmethod
+    def of(ways: list[Route]) -> _Reach:
+        if not ways:
+            return _Reach(0.0, 0.0, 0.0)
+        ends = np.array([way.points_mm[-1] for way in ways])
+        to_apex = ends @ np.array([0.0, -0.7, -0.7])
+        longest = max(way.length_mm for way in ways)
+        return _Reach(float(to_apex.max()), float(ends[:, 1].max()), longest)
+
+
+def _left(a: Route, c: Route, reach: _Reach, calibre: float, whole: float) -> Reading | None:
     """Read two ways as LAD and LCx with their common trunk; None where they have none."""
     shared = _shared(a, c)
     trunk = a.node_arc_mm[shared]
@@ -243,10 +262,7 @@ def _left(a: Route, c: Route, ways: list[Route], calibre: float, whole: float) -
     near_a, near_c = (way.at(np.array(trunk + _NEAR_MM)) for way in (a, c))
     r_trunk = a.mean_radius(0.0, trunk)
     r_lad, r_lcx = (way.mean_radius(trunk, trunk + _NEAR_MM) for way in (a, c))
-    ends = np.array([way.points_mm[-1] for way in ways])
-    # How much further than these ends other vessels reach: forward and down, and back.
-    to_apex, to_back = ends @ np.array([0.0, -0.7, -0.7]), ends[:, 1]
-    longest = max(way.length_mm for way in ways)
+    longest = reach.longest_mm
     own_a = a.points_mm[-1] @ np.array([0.0, -0.7, -0.7])
     figures = [
         *_unit(a.points_mm[-1] - fork), *_unit(c.points_mm[-1] - fork),
@@ -254,7 +270,7 @@ def _left(a: Route, c: Route, ways: list[Route], calibre: float, whole: float) -
         np.log(max(trunk, 1.0)), np.log(a.length_mm / longest), np.log(c.length_mm / longest),
         np.log(2 * r_trunk / (r_lad + r_lcx)), np.log(r_lad / r_lcx), calibre,
         np.linalg.norm(a.points_mm[-1] - fork) / lad, np.linalg.norm(c.points_mm[-1] - fork) / lcx,
-        (to_apex.max() - own_a) / 20.0, (to_back.max() - c.points_mm[-1, 1]) / 20.0,
+        (reach.to_apex_mm - own_a) / 20.0, (reach.to_back_mm - c.points_mm[-1, 1]) / 20.0,
         (trunk + lad + lcx) / whole, (c.points_mm[-1, 2] - a.points_mm[-1, 2]) / 20.0,
     ]  # fmt: skip
     return Reading("left", names, np.array(figures), a.nodes[0])

@@ -28,6 +28,10 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _BAR_MM = 20
 _WHITE, _BLACK, _RED = (255, 255, 255), (0, 0, 0), (60, 40, 255)
 _AROUND = tuple((dx, dy) for dx in (-2, -1, 0, 1, 2) for dy in (-2, -1, 0, 1, 2) if dx or dy)
+#: PNG by zlib's quickest, rows as they are: a third of the time, and a tenth more bytes
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # OpenCV 4.12 or newer
+    _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
 #: branches shorter than this on the screen get no number, numbers keep this distance, pixels
 _NUMBER_GAP = 30
 
@@ -129,7 +133,7 @@ def png_bytes(picture: Array) -> bytes:
     GcarError
         OpenCV could not.
     """
-    ok, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    ok, data = cv2.imencode(".png", picture, _PNG)
     if not ok:
         raise GcarError("a picture could not be encoded as PNG")
     return bytes(data.tobytes())

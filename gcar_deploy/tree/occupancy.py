@@ -6,6 +6,8 @@ through are supersampled.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from gcar_deploy.geometry.grid import Grid
@@ -40,17 +42,8 @@ def tree_occupancy(tree: Tree, grid: Grid) -> Volume:
 def sparse_occupancy(tree: Tree, grid: Grid) -> tuple[Array, Array]:
     """Like ``tree_occupancy``, but only (n,) flat voxel indices and their coverage."""
     capsules = tree.segments()
-    if not len(capsules[0]):
-        return np.zeros(0, np.int64), np.zeros(0, np.float32)
-    spacing = grid.spacing_mm
-    half_diagonal = 0.5 * float(np.linalg.norm(spacing))
-    voxel, capsule = near_pairs(capsules, grid, half_diagonal)
-    distance = np.empty(len(voxel))
-    for part in _chunks(len(voxel), CHUNK):
-        center = grid.index2world(np.stack(np.unravel_index(voxel[part], grid.shape), axis=1))
-        distance[part] = capsule_distance(center, capsules, capsule[part])
-    keep = distance < half_diagonal
-    voxel, capsule, distance = voxel[keep], capsule[keep], distance[keep]
+    half_diagonal = 0.5 * float(np.linalg.norm(grid.spacing_mm))
+    voxel, capsule, distance = near_pairs(capsules, grid, half_diagonal)
     if not len(voxel):
         return np.zeros(0, np.int64), np.zeros(0, np.float32)
     order = np.argsort(voxel, kind="stable")
@@ -70,49 +63,68 @@ def sparse_occupancy(tree: Tree, grid: Grid) -> tuple[Array, Array]:
 
 
 def near_pairs(
-    capsules: tuple[Points, Points, Scalars, Scalars], grid: Grid, margin_mm: float
-) -> tuple[Array, Array]:
-    """Pair each capsule with the voxels of its box, grown by ``margin_mm``.
+    capsules: tuple[Points, Points, Scalars, Scalars], grid: Grid, far_mm: float
+) -> tuple[Array, Array, Scalars]:
+    """Pair each capsule with the voxels whose middle lies less than ``far_mm`` outside it.
 
     Returns
     -------
     voxel : (p,) int64 flat index
-    capsule : (p,) int64
+    capsule : (p,) int64, rising
+    distance_mm : (p,) signed distance of the voxel's middle to that capsule, negative inside; the
+        radius is that at the foot of the perpendicular, which is exact for constant radius and
+        right to second order in the taper
     """
     a, b, ra, rb = capsules
-    reach = (np.maximum(ra, rb) + margin_mm)[:, None]
+    reach = (np.maximum(ra, rb) + far_mm)[:, None]
     low = np.ceil(grid.world2index(np.minimum(a, b) - reach)).astype(np.int64)
     high = np.floor(grid.world2index(np.maximum(a, b) + reach)).astype(np.int64) + 1
     low = np.clip(low, 0, grid.shape)
     size = np.maximum(np.clip(high, 0, grid.shape) - low, 0)
-    count = size.prod(axis=1)
-    capsule = np.repeat(np.arange(len(a)), count)
-    within = np.arange(len(capsule)) - np.repeat(np.cumsum(count) - count, count)
-    dy, dz = size[capsule, 1], size[capsule, 2]
-    x = low[capsule, 0] + within // (dy * dz)
-    y = low[capsule, 1] + (within // dz) % dy
-    z = low[capsule, 2] + within % dz
-    return np.ravel_multi_index((x, y, z), grid.shape).astype(np.int64), capsule
+    # Columns along z of the box round each capsule: most of the sums are the same along one.
+    count = size[:, 0] * size[:, 1] * (size[:, 2] > 0)
+    own = np.repeat(np.arange(len(a)), count)
+    within = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+    x, y = low[own, 0] + within // size[own, 1], low[own, 1] + within % size[own, 1]
+    height = size[own, 2]
+    found = [
+        _near_columns((x[part], y[part], low[own[part], 2], height[part]), capsules, own[part],
+                      grid, far_mm)
+        for part in _chunks(np.cumsum(height), CHUNK)
+    ]  # fmt: skip
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    voxel, capsule, distance = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return voxel, capsule, distance
 
 
-def capsule_distance(
-    points: Points, capsules: tuple[Points, Points, Scalars, Scalars], which: Array
-) -> Scalars:
-    """Signed distance (negative inside) of (p, 3) points to capsule ``which`` (p,), mm.
-
-    The radius is interpolated at the foot of the perpendicular, which is exact for constant
-    radius and right to second order in the taper.
-    """
+def _near_columns(
+    columns: tuple[Array, Array, Array, Array], capsules: tuple[Points, Points, Scalars, Scalars],
+    own: Array, grid: Grid, far_mm: float,
+) -> tuple[Array, Array, Scalars]:  # fmt: skip
+    """``near_pairs`` of columns (x, y, first z, height) with one capsule each."""
+    x, y, first, height = columns
     a, b, ra, rb = capsules
     axis = b - a
     length2 = np.maximum(np.einsum("ij,ij->i", axis, axis), 1e-18)
-    start = a[which]
-    along = axis[which]
-    rel = points - start
-    t = np.clip(np.einsum("ij,ij->i", rel, along) / length2[which], 0.0, 1.0)
-    rel -= t[:, None] * along
-    radius = ra[which] + t * (rb - ra)[which]
-    return np.sqrt(np.einsum("ij,ij->i", rel, rel)) - radius
+    lower, spacing = grid.lower_mm, grid.spacing_mm
+    rx = lower[0] + (x + 0.5) * spacing[0] - a[own, 0]
+    ry = lower[1] + (y + 0.5) * spacing[1] - a[own, 1]
+    along = rx * axis[own, 0] + ry * axis[own, 1]
+    flat = (x * grid.shape[1] + y) * grid.shape[2]
+    column = np.repeat(np.arange(len(x)), height)
+    z = np.arange(len(column)) - np.repeat(np.cumsum(height) - height - first, height)
+    capsule = own[column]
+    ax, ay, az = np.ascontiguousarray(axis.T)
+    az = az[capsule]
+    rz = lower[2] + (z + 0.5) * spacing[2] - a[:, 2][capsule]
+    t = (along[column] + rz * az) / length2[capsule]
+    t = np.minimum(np.maximum(t, 0.0), 1.0)
+    dx, dy = rx[column] - t * ax[capsule], ry[column] - t * ay[capsule]
+    rz -= t * az
+    distance = np.sqrt(dx * dx + dy * dy + rz * rz) - (ra[capsule] + t * (rb - ra)[capsule])
+    near = np.flatnonzero(distance < far_mm)
+    return flat[column[near]] + z[near], capsule[near], distance[near]
 
 
 def _supersampled(
@@ -151,5 +163,10 @@ def _supersampled(
     return (total / len(offsets)).astype(np.float32)
 
 
-def _chunks(total: int, size: int) -> list[slice]:
-    return [slice(start, start + size) for start in range(0, total, size)]
+def _chunks(total: Array, size: int) -> list[slice]:
+    """Slices of columns that hold some ``size`` voxels each; ``total`` is their running sum."""
+    if not len(total):
+        return []
+    cuts = np.searchsorted(total, np.arange(size, int(total[-1]), size), side="left") + 1
+    cuts = np.unique(np.concatenate([[0], cuts, [len(total)]])).tolist()
+    return [slice(start, stop) for start, stop in itertools.pairwise(cuts)]

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.tree.occupancy import capsule_distance, near_pairs
+from gcar_deploy.tree.occupancy import near_pairs
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Points
 
@@ -25,8 +25,6 @@ EDGE_BOUNDS_MM = (0.25, 0.6)
 MAX_POINTS = 40_000_000
 #: coarsest lattice ever used, mm.
 COARSEST_MM = 0.8
-#: capsules handled at once.
-CHUNK = 64
 #: lattice points along the edge of a block
 BLOCK = 24
 #: distances are exact to so far outside, lattice edges
@@ -79,28 +77,29 @@ def _blocks(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
     Blocks share the points of their common planes.
     """
     number = np.full(-(-np.array(lattice.shape) // BLOCK) + 1, -1)
-    near = [
-        (np.stack(np.unravel_index(cell, lattice.shape)), d) for cell, d in _near(tree, lattice)
-    ]
-    for at, _ in near:
-        number[tuple(at // BLOCK)] = 0
+    cell, value = _near(tree, lattice)
+    at = np.unravel_index(cell, lattice.shape)
+    block = tuple(x // BLOCK for x in at)
+    number[block] = 0
     occupied = np.argwhere(number == 0)
     number[tuple(occupied.T)] = np.arange(len(occupied))
     edge = float(lattice.spacing_mm[0])
     # One more, which number -1 finds: no vessel.
     tiles = np.full((len(occupied) + 1, BLOCK, BLOCK, BLOCK), FAR * edge, np.float32)
-    for at, value in near:
-        np.minimum.at(tiles, (number[tuple(at // BLOCK)], *(at % BLOCK)), value)
+    place = number[block]
+    for x, first in zip(at, block, strict=True):
+        place = place * BLOCK + (x - first * BLOCK)
+    np.minimum.at(tiles.reshape(-1), place, value)
     # A vertex exactly on a lattice point would collapse triangles; nothing may be exactly 0.
     tiles[np.abs(tiles) < 1e-3 * edge] = 1e-3 * edge
-    for block in occupied:
+    for corner in occupied:
         distance = np.empty((BLOCK + 1,) * 3, np.float32)
         for beyond in itertools.product((0, 1), repeat=3):
             to = tuple(slice(BLOCK, None) if d else slice(BLOCK) for d in beyond)
             of = tuple(slice(1) if d else slice(None) for d in beyond)
-            distance[to] = tiles[number[tuple(block + beyond)]][of]
+            distance[to] = tiles[number[tuple(corner + beyond)]][of]
         if distance.min() < 0 < distance.max():
-            yield BLOCK * block, distance
+            yield BLOCK * corner, distance
 
 
 def _merged(vertices: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
@@ -158,19 +157,11 @@ def lumen_lattice(tree: Tree, edge_mm: float | None) -> Grid:
 def lumen_distance(tree: Tree, lattice: Grid) -> Array:
     """(nx, ny, nz) float32 signed distance near the surface, mm; a constant further outside."""
     out = np.full(int(np.prod(lattice.shape)), FAR * float(lattice.spacing_mm[0]), np.float32)
-    for cell, value in _near(tree, lattice):
-        np.minimum.at(out, cell, value)
+    np.minimum.at(out, *_near(tree, lattice))
     return out.reshape(lattice.shape)
 
 
-def _near(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
-    """Yield flat lattice indices near some capsules and the distance from one of these, mm."""
-    capsules = tree.segments()
-    far = FAR * float(lattice.spacing_mm[0])
-    for start in range(0, len(capsules[0]), CHUNK):
-        part = tuple(x[start : start + CHUNK] for x in capsules)
-        cell, capsule = near_pairs((part[0], part[1], part[2], part[3]), lattice, far)
-        center = lattice.index2world(np.stack(np.unravel_index(cell, lattice.shape), axis=1))
-        value = capsule_distance(center, (part[0], part[1], part[2], part[3]), capsule)
-        within = value < far
-        yield cell[within], value[within].astype(np.float32)
+def _near(tree: Tree, lattice: Grid) -> tuple[Array, Array]:
+    """Flat lattice indices near each capsule, and the distance from it, mm."""
+    cell, _, distance = near_pairs(tree.segments(), lattice, FAR * float(lattice.spacing_mm[0]))
+    return cell, distance.astype(np.float32)

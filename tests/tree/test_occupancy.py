@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.tree.occupancy import sparse_occupancy, tree_occupancy
+from gcar_deploy.tree import occupancy
+from gcar_deploy.tree.occupancy import near_pairs, sparse_occupancy, tree_occupancy
 from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.tree.shapes import branch, fork, grid, tube
 
@@ -64,3 +65,25 @@ def test_oblong_voxels_and_tubes_outside():
 def test_empty_tree():
     assert not tree_occupancy(empty_tree(), grid(8)).any()
     assert len(sparse_occupancy(empty_tree(), grid(8))[0]) == 0
+
+
+@pytest.mark.parametrize("most", [1, 1000, 200_000])
+def test_pairs_are_those_of_all_voxels_and_capsules(monkeypatch, most):
+    monkeypatch.setattr(occupancy, "CHUNK", most)
+    # Oblong voxels; one capsule reaches out of the grid, one is a point, one lies outside.
+    where = Grid(center_mm=(1, -2, 3), size_mm=(24, 15, 22), shape=(20, 15, 11))
+    a = np.array([[-4.0, -3, -5], [4, 3.3, 5], [9, 0, 9], [2, -3, 4], [80, 0, 0]])
+    b = np.array([[4.0, 3.3, 5], [4.2, 3.3, 5.9], [40, 8, 30], [2, -3, 4], [90, 0, 0]])
+    ra, rb = np.array([0.4, 1.7, 3.0, 2.0, 1.0]), np.array([1.7, 0.8, 2.0, 2.0, 1.0])
+    index = np.stack(np.unravel_index(np.arange(np.prod(where.shape)), where.shape), 1)
+    points, expected = where.index2world(index), {}
+    for k in range(len(a)):
+        axis = b[k] - a[k]
+        t = np.clip((points - a[k]) @ axis / max(axis @ axis, 1e-18), 0, 1)
+        far = np.linalg.norm(points - a[k] - t[:, None] * axis, axis=1)
+        far -= ra[k] + t * (rb[k] - ra[k])
+        expected |= {(v, k): far[v] for v in np.flatnonzero(far < 1.1)}
+    voxel, capsule, distance = near_pairs((a, b, ra, rb), where, 1.1)
+    found = dict(zip(zip(voxel.tolist(), capsule.tolist(), strict=True), distance, strict=True))
+    assert found.keys() == expected.keys() and len(found) == len(voxel)
+    assert [found[key] for key in expected] == pytest.approx(list(expected.values()), abs=1e-12)
