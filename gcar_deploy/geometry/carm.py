@@ -354,8 +354,15 @@ class CArm:
             self, isocenter_offset_mm=tuple(total.tolist()), projection_matrix=matrix
         )
 
-    def turned(self, primary_deg: float = 0.0, secondary_deg: float = 0.0) -> CArm:
+    def turned(
+        self,
+        primary_deg: float = 0.0,
+        secondary_deg: float = 0.0,
+        offset_mm: Any = (0.0, 0.0, 0.0),
+    ) -> CArm:
         """Return the same view with angles changed by so many degrees (matrix dropped).
+
+        ``offset_mm`` (3,) moves the patient as well, as ``moved`` does.
 
         Beyond the poles and the back the same direction is named within the allowed ranges:
         (a, b, g) = (a + 180, 180 - b, g + 180).
@@ -371,6 +378,7 @@ class CArm:
             primary_angle_deg=primary if abs(primary) <= 180.0 else (primary + 180) % 360 - 180,
             secondary_angle_deg=secondary,
             detector_rotation_deg=rotation,
+            isocenter_offset_mm=tuple(np.add(self.isocenter_offset_mm, offset_mm).tolist()),
             projection_matrix=None,
         )
 

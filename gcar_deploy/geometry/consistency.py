@@ -84,11 +84,12 @@ def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tup
         value = mass.path * weight
         profile = np.bincount(low, value * (1 - part), n)
         profile += np.bincount(low + 1, value * part, n)
-        out.append(gaussian_filter1d(profile, sigma_mm / BIN_MM, mode="constant"))
+        out.append(profile)
         sums.append(float(value.sum()))
     if fixed.calibrated and moving.calibrated:
         sums = [0.5 * (sums[0] + sums[1])] * 2
-    return out[0] / sums[0], out[1] / sums[1]
+    first, second = gaussian_filter1d(np.stack(out), sigma_mm / BIN_MM, mode="constant")
+    return first / sums[0], second / sums[1]
 
 
 def uncovered_mm(fixed: Mass, moving: Mass, carm: CArm) -> float:

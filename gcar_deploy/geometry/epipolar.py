@@ -75,6 +75,8 @@ def ray_gaps(first: CArm, second: CArm, a: Pixels, b: Pixels) -> Scalars:
     -------
     (n,) mm, along the common normal of both rays; 0 where they meet
     """
+    if not len(a):
+        return np.zeros(0)
     normal = np.cross(first.rays(a), second.rays(b))
     length = np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
     gaps: Scalars = normal @ (second.source_mm - first.source_mm) / length

@@ -50,7 +50,7 @@ def corrected(carm: CArm, theta: Array) -> CArm:
     if not theta.any():
         return carm
     if theta[3] or theta[4]:
-        carm = carm.turned(float(theta[3]), float(theta[4]))
+        return carm.turned(float(theta[3]), float(theta[4]), theta[:3])
     return carm.moved(theta[:3])
 
 

@@ -253,3 +253,9 @@ def test_turning_over_the_ends_of_the_ranges(start, step):
         [np.sin(a) * np.cos(b), -np.cos(a) * np.cos(b), np.sin(b)],
     ]
     np.testing.assert_allclose(carm.axes, R, atol=1e-12)
+
+
+def test_turned_with_an_offset_is_turned_then_moved():
+    carm = CArm(primary_angle_deg=30, secondary_angle_deg=-20, **BASE).moved((1.0, 2.0, 3.0))
+    offset = np.array([-4.0, 0.5, 7.0])
+    assert carm.turned(2.0, -3.0, offset) == carm.turned(2.0, -3.0).moved(offset)

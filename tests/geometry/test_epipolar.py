@@ -79,3 +79,4 @@ def test_rays_of_one_point_meet_and_a_move_along_the_normal_parts_them():
     within = np.cross(normal, second.axes[2])
     silent = second.moved(2.0 * within).project(points)[0]
     assert abs(ray_gaps(first, second, a, silent)[0]) < 1e-6
+    assert ray_gaps(first, second, a[:0], a[:0]).shape == (0,)
