@@ -113,9 +113,11 @@ def _table() -> Array:
         # The integral of the chord is smooth where the chord itself has an edge.
         edges = np.clip(np.append(u - step / 2, u[-1] + step / 2), -1, 1)
         whole = edges * np.sqrt(1 - edges**2) + np.arcsin(edges)
-        frequency = np.fft.rfftfreq(2 * len(u), step)
+        # A power of two, which the transform likes best, and room for what the blur spreads.
+        size = 1 << (2 * len(u) - 1).bit_length()
+        frequency = np.fft.rfftfreq(size, step)
         smooth = np.exp(-2 * (np.pi * blur * frequency) ** 2)
-        chord = np.fft.irfft(np.fft.rfft(np.diff(whole) / step, 2 * len(u)) * smooth, 2 * len(u))
+        chord = np.fft.irfft(np.fft.rfft(np.diff(whole) / step, size) * smooth, size)
         g = chord[: len(u)]
         slope = np.gradient(g, step)
         # Heat equation: blur^2 d/d(blur^2) g = blur^2 g'' / 2.
