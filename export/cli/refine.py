@@ -51,15 +51,16 @@ def refine_table(data: Path, cases: str, protocols: str, noises: str, out: Path 
 
 @click.command("cost-curves")
 def cost_curves() -> None:
-    """Time refinement against Gaussians, views and pixels, and print the exponents.
+    """Time refinement against Gaussians, vessel, views, pixels, voxels; print the exponents.
 
     Example: gcar-export cost-curves
     """
     from gcar_export.studies import cost_curves as cost
 
-    total = len(cost.GAUSSIANS) + len(cost.VIEWS) + len(cost.PIXELS)
+    timed = cost.works()
+    total = cost.REPEATS * sum(len(sizes) for sizes in timed.values())
     with click.progressbar(length=total, label="sizes", file=sys.stderr) as bar:
-        found = cost.curves(lambda: bar.update(1))
+        found = cost.curves(lambda: bar.update(1), timed)
     click.echo(cost.table(found))
 
 

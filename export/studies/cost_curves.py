@@ -1,8 +1,9 @@
-"""What refinement costs: CPU seconds against Gaussians, views and pixels, with the exponents.
+"""What it costs: CPU seconds against Gaussians, vessel, views, pixels and voxels, with exponents.
 
-An exponent is the slope of log seconds over log size by least squares: 1 is proportional, 0 free.
-CPU seconds of this process, the least of ``REPEATS``, so that other work on the machine counts
-little.
+An exponent is the slope of log seconds over log size by least squares: 1 is proportional, 0 free;
+its 95 % interval is Student's, of what the line leaves. CPU seconds of this process, the least of
+``REPEATS`` rounds over all sizes of all curves, so that other work on the machine counts little and
+every size meets the same.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.stats import t as student
 
 from gcar_deploy.config import RefineOptions
 from gcar_deploy.gaussians.centers import CenterPoints
@@ -22,12 +24,17 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.selftest import EDGE_MM, tiny_tree
 from gcar_deploy.tree.occupancy import tree_occupancy
+from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
-from gcar_deploy.tubes.refine import refine
+from gcar_deploy.tubes.refine import Refined, refine, refined_volume
 
 GAUSSIANS = (100, 300, 1000, 3000, 10_000)
+#: vessels side by side, each of ``VESSEL_MM``
+VESSELS, VESSEL_MM = (1, 2, 4, 8), 40
 VIEWS = (2, 4, 8, 16)
 PIXELS = (128, 256, 512, 1024)
+#: voxels along an edge of the volume
+EDGES = (48, 72, 108, 162)
 REPEATS = 3
 
 
@@ -44,22 +51,53 @@ class Curve:
         """Slope of log seconds over log size."""
         return float(np.polyfit(np.log(self.sizes), np.log(self.seconds), 1)[0])
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the exponent; infinite of fewer than three sizes."""
+        x, y = np.log(self.sizes), np.log(self.seconds)
+        if len(x) < 3:
+            return -np.inf, np.inf
+        left = y - np.polyval(np.polyfit(x, y, 1), x)
+        free = len(x) - 2
+        sd = np.sqrt(float(left @ left) / free / float(((x - x.mean()) ** 2).sum()))
+        half = float(student.ppf(0.975, free)) * float(sd)
+        return self.exponent - half, self.exponent + half
 
-def curves(on_point: Callable[[], None] | None = None) -> list[Curve]:
-    """Measure all three."""
-    out = []
-    for name, sizes, work in (
-        ("Gaussians (one gradient, paper refiner, 128 px)", GAUSSIANS, _gradient),
-        ("views (whole tube refinement, 256 px)", VIEWS, lambda n: _tubes(n, 256)),
-        ("pixels (whole tube refinement, 2 views)", PIXELS, lambda n: _tubes(2, n)),
-    ):
-        seconds = []
-        for size in sizes:
-            seconds.append(_least_s(work(size)))
-            if on_point is not None:
-                on_point()
-        out.append(Curve(name, sizes, tuple(seconds)))
-    return out
+
+#: name of a curve -> size as it is printed -> what is timed
+Works = dict[str, dict[int, Callable[[], object]]]
+
+
+def works() -> Works:
+    """Return what is timed, set up."""
+    tree, rows = tiny_tree(), {n: _side_by_side(n) for n in VESSELS}
+    return {
+        "Gaussians (one gradient, paper refiner, 128 px)": {n: _gradient(n) for n in GAUSSIANS},
+        "vessel in mm (whole tube refinement, 2 views, 256 px)": {
+            n * VESSEL_MM: _tubes(rows[n], 2, 256) for n in VESSELS
+        },
+        "views (whole tube refinement, 256 px)": {n: _tubes(tree, n, 256) for n in VIEWS},
+        "pixels along an edge (whole tube refinement, 2 views)": {
+            n: _tubes(tree, 2, n) for n in PIXELS
+        },
+        "voxels (volume of a fitted tree, 2 views, 256 px)": {n**3: _volume(n) for n in EDGES},
+    }
+
+
+def curves(on_point: Callable[[], None] | None = None, timed: Works | None = None) -> list[Curve]:
+    """Measure all, the rounds one after the other."""
+    timed = works() if timed is None else timed
+    least = {name: dict.fromkeys(sizes, np.inf) for name, sizes in timed.items()}
+    for _ in range(REPEATS):
+        for name, sizes in timed.items():
+            for size, work in sizes.items():
+                start = time.process_time()
+                work()
+                spent = max(time.process_time() - start, 1e-6)
+                least[name][size] = min(least[name][size], spent)
+                if on_point is not None:
+                    on_point()
+    return [Curve(name, tuple(found), tuple(found.values())) for name, found in least.items()]
 
 
 def table(found: Sequence[Curve]) -> str:
@@ -69,17 +107,11 @@ def table(found: Sequence[Curve]) -> str:
         cells = ", ".join(
             f"{n}: {s:.3g} s" for n, s in zip(curve.sizes, curve.seconds, strict=True)
         )
-        lines.append(f"- {curve.name}: {cells}; exponent {curve.exponent:.2f}")
+        low, high = curve.interval
+        lines.append(
+            f"- {curve.name}: {cells}; exponent {curve.exponent:.2f} ({low:.2f} .. {high:.2f})"
+        )
     return "\n".join(lines)
-
-
-def _least_s(work: Callable[[], object]) -> float:
-    found = []
-    for _ in range(REPEATS):
-        start = time.process_time()
-        work()
-        found.append(time.process_time() - start)
-    return max(min(found), 1e-6)
 
 
 def _carm(primary: float, pixels: int) -> CArm:
@@ -102,11 +134,33 @@ def _gradient(count: int) -> Callable[[], object]:
     return lambda: project_vjp(g, view, project(g, view))
 
 
-def _tubes(views: int, pixels: int) -> Callable[[], object]:
-    """Return a whole refinement of a small tree from its true points."""
-    tree = tiny_tree()
-    side = int(EDGE_MM)
-    grid = Grid(center_mm=(0, 0, 0), size_mm=(EDGE_MM,) * 3, shape=(side,) * 3)
+def _side_by_side(count: int) -> Tree:
+    """Return so many bent vessels above each other, none joined."""
+    t = np.linspace(0.0, 1.0, VESSEL_MM + 1)[:, None]
+    lines = [
+        np.array([-20.0, 0.0, 7.0 * (k - (count - 1) / 2)])
+        + t * np.array([38.0, 0.0, 0.0]) + np.sin(np.pi * t) * np.array([0.0, 6.0, 2.0])
+        for k in range(count)
+    ]  # fmt: skip
+    branches = tuple(
+        Branch(
+            points_mm=line, radius_mm=np.linspace(1.5, 1.0, len(line)),
+            sigma_mm=np.full(len(line), np.nan), confidence=np.ones(len(line)),
+            start=2 * k, end=2 * k + 1,
+        )
+        for k, line in enumerate(lines)
+    )  # fmt: skip
+    nodes = np.concatenate([line[[0, -1]] for line in lines])
+    return Tree(nodes_mm=nodes, branches=branches)
+
+
+def _grid(edge: int) -> Grid:
+    return Grid(center_mm=(0, 0, 0), size_mm=(EDGE_MM,) * 3, shape=(edge,) * 3)
+
+
+def _tubes(tree: Tree, views: int, pixels: int) -> Callable[[], Refined]:
+    """Return a whole refinement of a tree from its true points."""
+    grid = _grid(int(EDGE_MM))
     volume = tree_occupancy(tree, grid)
     centers = CenterPoints(
         points_mm=grid.index2world(np.argwhere(volume > 0)),
@@ -115,10 +169,20 @@ def _tubes(views: int, pixels: int) -> Callable[[], object]:
         spacing_mm=1.0,
         source="multi",
     )
-    seen = [
-        _seen(tubes_of(tree), _carm(-60.0 + 150.0 * k / views, pixels), k) for k in range(views)
-    ]
+    seen = _views(tree, views, pixels)
     return lambda: refine(centers, seen, RefineOptions())
+
+
+def _volume(edge: int) -> Callable[[], object]:
+    """Return the volume of a small tree after its fit."""
+    tree = tiny_tree()
+    refined, seen, grid = _tubes(tree, 2, 256)(), _views(tree, 2, 256), _grid(edge)
+    return lambda: refined_volume(refined, seen, grid)
+
+
+def _views(tree: Tree, count: int, pixels: int) -> list[VesselImage]:
+    tubes = tubes_of(tree)
+    return [_seen(tubes, _carm(-60.0 + 150.0 * k / count, pixels), k) for k in range(count)]
 
 
 def _seen(tubes: Tubes, view: CArm, number: int) -> VesselImage:

@@ -15,7 +15,7 @@ from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.targets import make_targets
 from gcar_export.studies import refine_table as refining
 from gcar_export.studies import sigma_table as sigma
-from gcar_export.studies.cost_curves import Curve
+from gcar_export.studies.cost_curves import REPEATS, Curve, curves
 from tests.export.label_files import write_tree
 from tests.tree.shapes import branch
 
@@ -24,6 +24,27 @@ def test_exponent_of_a_power_law():
     sizes = (100, 300, 1000)
     curve = Curve("x", sizes, tuple(2e-4 * n**1.5 for n in sizes))
     assert curve.exponent == pytest.approx(1.5)
+    assert curve.interval == pytest.approx((1.5, 1.5), abs=1e-6)
+
+
+def test_interval_of_an_exponent_holds_the_true_one_as_often_as_it_says():
+    rng, sizes = np.random.default_rng(0), np.array([100, 300, 1000, 3000])
+    held = 0
+    for _ in range(400):
+        seconds = 2e-4 * sizes**0.7 * np.exp(rng.normal(0, 0.2, len(sizes)))
+        low, high = Curve("x", tuple(sizes), tuple(seconds)).interval
+        held += low <= 0.7 <= high
+    assert 0.92 <= held / 400 <= 0.98
+    assert Curve("x", (1, 2), (1.0, 2.0)).interval == (-np.inf, np.inf)
+
+
+def test_every_size_is_timed_in_every_round():
+    asked = []
+    timed = {name: {n: lambda n=n, name=name: asked.append((name, n)) for n in (1, 2)}
+             for name in ("a", "b")}  # fmt: skip
+    found = curves(timed=timed)
+    assert asked == [("a", 1), ("a", 2), ("b", 1), ("b", 2)] * REPEATS
+    assert [(c.name, c.sizes) for c in found] == [("a", (1, 2)), ("b", (1, 2))]
 
 
 def test_modes_differ_in_the_centreline_alone():
