@@ -228,6 +228,10 @@ class Reconstruction:
         for path in reasons:
             if path.startswith("/tree/branches/") and path.endswith(_LUMEN):
                 reasons[path] = "the branch is too short to state a stenosis"
+            if "/picture/frame/" in path:
+                reasons[path] = (
+                    "chosen without a look at another run, or no frame shows another phase"
+                )
             if path.endswith(("/name", "/name_confidence")):
                 reasons[path] = f"no name is as probable as {LEAST_CONFIDENCE:g}"
             if path.endswith(("/ghost_probability", "/ghost_share")):
@@ -317,6 +321,7 @@ class Reconstruction:
                 "bit_depth": angiogram.bit_depth,
                 "rows": angiogram.carm.rows,
                 "columns": angiogram.carm.columns,
+                **({} if angiogram.frame is None else {"frame": angiogram.frame.to_dict()}),
             },
             "kind": self.views[k].kind,
             "calibrated": self.views[k].calibrated,

@@ -22,6 +22,7 @@ RUNTIME_FLOORS = (
     "models",
     "imaging",
     "gaussians dicom",
+    "frames",
     "tree inputs",
     "predict tubes measure",
     "quality flow",

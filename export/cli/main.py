@@ -13,6 +13,7 @@ import click
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli.centers import centers_table, robustness
 from gcar_export.cli.evaluate import converge, evaluate, paper_page
+from gcar_export.cli.frames import frame_pairs
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table
 from gcar_export.cli.wrong_scenes import wrong_scenes
@@ -305,6 +306,7 @@ for _verb in (
     flow_table,
     gate_table,
     wrong_scenes,
+    frame_pairs,
     ghost_fit,
     status_table,
 ):

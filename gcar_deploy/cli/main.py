@@ -18,6 +18,7 @@ VERBS = {
     "run": ("gcar_deploy.cli.run", "Reconstruct a coronary tree from two or more pictures."),
     "open": ("gcar_deploy.cli.open", "See, correct and run a case in the browser."),
     "validate": ("gcar_deploy.cli.validate", "Check pictures and geometry; reconstruct nothing."),
+    "frames": ("gcar_deploy.cli.frames", "Find the frames of two runs that go together."),
     "geometry": ("gcar_deploy.cli.geometry", "Read or show where the views were taken from."),
     "enhance": ("gcar_deploy.cli.enhance", "Show the steps of finding vessels in one picture."),
     "flow": (

@@ -45,7 +45,8 @@ OPTIONS: Mapping[str, _Option] = {
     ),
     "frames": click.option(
         "--frame", "frames", metavar="N|auto", show_default="auto",
-        help="DICOM: frame of the run, from 1; one for all files, or 7,12 for each.",
+        help="Frame of each run (DICOM, folder, TIFF of pages), from 1; one for all, or 7,12; "
+        "auto takes frames that go together.",
     ),
     "pixel_spacing_mm": click.option(
         "--pixel-spacing", "pixel_spacing_mm", type=click.FloatRange(0.02, 10), metavar="MM",

@@ -19,6 +19,9 @@ class QualityOptions:
     #: errors in the picture, 11-fold at 5 deg (not worth having), 2.4-fold at 25 deg
     min_separation_deg: Angle = 5.0
     good_separation_deg: Angle = 25.0
+    #: frames of two runs whose score is less ahead of that of another heart phase may show two
+    #: phases: ``gcar-export frame-pairs``
+    good_frame_margin: Gate = 0.03
     #: The gates below were judged by ``gcar-export gate-table``: 24 generated trees to choose on,
     #: 24 others to check, then ten real ones to look at; each as pairs of one tree and as pairs
     #: that contradict each other (two trees, a wrong sign of an angle, swapped pictures). None of

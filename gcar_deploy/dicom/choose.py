@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Protocol
 
 import cv2
 import numpy as np
 
-from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import Header
 from gcar_deploy.errors import UsageError
-from gcar_deploy.types import Array, Scalars
+from gcar_deploy.types import Array, Image, Scalars
 
 #: frames filled to this share of the best are compared by their stillness
 _FILLED_SHARE = 0.9
@@ -37,13 +37,27 @@ class Choice:
     note: str | None = None
 
 
-def choose_frame(frames: Frames, wanted: int | None) -> Choice:
+class FrameSource(Protocol):
+    """A run whose frames can be read one at a time; a header where it is a DICOM run."""
+
+    @property
+    def header(self) -> Header | None:
+        """Header of a DICOM run."""
+
+    def __len__(self) -> int: ...
+
+    def decode(self, index: int) -> Image:
+        """(rows, columns) float32 counts of a frame, from 0."""
+
+
+def choose_frame(frames: FrameSource, wanted: int | None, name: str = "") -> Choice:
     """Take the frame asked for, else one at an R wave, the file's own, or the best filled.
 
     Parameters
     ----------
-    frames : Frames
+    frames : Frames, or another run of several pictures
     wanted : int from 1, or None to choose
+    name : of the run, for messages; the header's where it has one
 
     Raises
     ------
@@ -55,16 +69,17 @@ def choose_frame(frames: Frames, wanted: int | None) -> Choice:
     header = frames.header
     if wanted is not None:
         if not 1 <= wanted <= len(frames):
-            raise UsageError(f"--frame {wanted} is outside 1 .. {len(frames)} of {header.name}")
+            name = name if header is None else header.name
+            raise UsageError(f"--frame {wanted} is outside 1 .. {len(frames)} of {name}")
         return Choice(index=wanted - 1, reason="asked for")
     if len(frames) == 1:
         return Choice(index=0, reason="the only one")
     filling, motion = filling_and_motion(frames)
-    beats = r_wave_frames(header)
+    beats = [] if header is None else r_wave_frames(header)
     if beats:
         best = max(beats, key=lambda k: filling[k])
         return Choice(index=best, reason="the best filled at an R wave", note=_doubt(filling, best))
-    own = header.number("RepresentativeFrameNumber")
+    own = None if header is None else header.number("RepresentativeFrameNumber")
     if own is not None and 1 <= own <= len(frames):
         index = int(own) - 1
         return Choice(
@@ -106,7 +121,7 @@ def _frame_times(header: Header) -> Scalars | None:
     return None if not step else np.arange(header.frames, dtype=np.float64) * step
 
 
-def filling_and_motion(frames: Frames) -> tuple[Scalars, Scalars]:
+def filling_and_motion(frames: FrameSource) -> tuple[Scalars, Scalars]:
     """Contrast filling (1 where it is best) and motion of every frame.
 
     Filling is the mean black top-hat: dark lines narrower than a large vessel. What stays in all

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gcar_deploy.config import DicomOptions
 from gcar_deploy.dicom.carm import frame_carm, is_flipped
-from gcar_deploy.dicom.choose import choose_frame
+from gcar_deploy.dicom.choose import Choice, choose_frame
 from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import SYNTAXES, Header, read_header, tag
 from gcar_deploy.dicom.shutter import open_field
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.frame import ChosenFrame
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
@@ -35,6 +36,7 @@ class Run:
     valid : (rows, cols) bool or None, outside shutters and collimator there is no picture
     intensity : Intensity
     notes : ends of sentences; no file name, for they stand in results
+    chosen : the frame where it was chosen among several, None where it was asked for
     """
 
     header: Header
@@ -43,10 +45,17 @@ class Run:
     valid: Mask | None
     intensity: Intensity
     notes: tuple[str, ...]
+    chosen: ChosenFrame | None = None
 
 
-def read_run(path: str | Path, options: DicomOptions, wanted: int | None = None) -> Run:
-    """Read a run and choose its frame (``wanted`` counts from 1, None chooses).
+def read_run(
+    path: str | Path, options: DicomOptions, wanted: int | ChosenFrame | None = None
+) -> Run:
+    """Read a run and choose its frame.
+
+    Parameters
+    ----------
+    wanted : from 1, None to choose, or what was chosen already
 
     Raises
     ------
@@ -54,25 +63,33 @@ def read_run(path: str | Path, options: DicomOptions, wanted: int | None = None)
     """
     header = read_header(path, options.limits)
     frames = Frames(header)
-    choice = choose_frame(frames, wanted)
+    if isinstance(wanted, ChosenFrame):
+        chosen: ChosenFrame | None = wanted
+        choice = Choice(index=wanted.number - 1, reason=wanted.reason)
+    else:
+        choice, chosen = choose_frame(frames, wanted), None
+        if wanted is None and len(frames) > 1:
+            chosen = ChosenFrame(number=choice.index + 1, of=len(frames), reason=choice.reason)
     pixels = frames.decode(choice.index)
     valid = open_field(header, choice.index)
     if is_flipped(header, choice.index):
         pixels = np.ascontiguousarray(pixels[:, ::-1])
         valid = None if valid is None else np.ascontiguousarray(valid[:, ::-1])
-    intensity, notes = _intensity(header, choice.index)
+    intensity, notes = intensity_of(header, choice.index)
     if choice.reason != "the only one":
         notes.insert(0, f"frame {choice.index + 1} of {len(frames)}: {choice.reason}")
     notes += [choice.note] if choice.note else []
     notes += _warnings(header, choice.index)
     return Run(
         header=header, index=choice.index, pixels=pixels, valid=valid, intensity=intensity,
-        notes=tuple(notes),
+        notes=tuple(notes), chosen=chosen,
     )  # fmt: skip
 
 
 def read_views(
-    paths: Sequence[str | Path], options: DicomOptions
+    paths: Sequence[str | Path],
+    options: DicomOptions,
+    chosen: Mapping[int, ChosenFrame] | None = None,
 ) -> tuple[list[Angiogram], Scene, list[str]]:
     """Read runs whose headers tell the whole geometry.
 
@@ -80,6 +97,7 @@ def read_views(
     ----------
     paths : two or more files
     options : DicomOptions; ``frames`` has one entry, or one for each file
+    chosen : number of the view, from 1 -> its frame, where that was chosen already
 
     Returns
     -------
@@ -92,7 +110,7 @@ def read_views(
     wanted = wanted_frames(options, len(paths))
     angiograms, views, notes = [], [], []
     for number, (path, frame) in enumerate(zip(paths, wanted, strict=True), start=1):
-        run = read_run(path, options, frame)
+        run = read_run(path, options, (chosen or {}).get(number, frame))
         carm, said = frame_carm(run.header, run.index, options)
         # By number: a result must not carry the name of a file, which may be the patient's.
         notes += [f"view {number}: {note}" for note in (*run.notes, *said)]
@@ -108,7 +126,7 @@ def as_angiogram(run: Run, view: View) -> Angiogram:
     """Pair a frame with its view."""
     return Angiogram(
         view_id=view.id, carm=view.carm, pixels=run.pixels, bit_depth=run.header.bits,
-        intensity=view.intensity, sha256=run.header.sha256, valid=run.valid,
+        intensity=view.intensity, sha256=run.header.sha256, valid=run.valid, frame=run.chosen,
     )  # fmt: skip
 
 
@@ -124,13 +142,13 @@ def wanted_frames(options: DicomOptions, runs: int) -> tuple[int | None, ...]:
         return options.frames * runs
     if len(options.frames) != runs:
         raise UsageError(
-            f"--frame names {len(options.frames)} frames for {runs} DICOM files; "
+            f"--frame names {len(options.frames)} frames for {runs} DICOM files or runs; "
             "give one, or one for each file"
         )
     return options.frames
 
 
-def _intensity(header: Header, frame: int) -> tuple[Intensity, list[str]]:
+def intensity_of(header: Header, frame: int) -> tuple[Intensity, list[str]]:
     """Read what the counts mean (PS3.3 C.8.11.3.1.2), from the frame as ``Frames`` gives it."""
     relation = header.text("PixelIntensityRelationship", frame)
     sign = header.number("PixelIntensityRelationshipSign", frame)

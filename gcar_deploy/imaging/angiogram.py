@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from gcar_deploy.errors import ImageError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.imaging.frame import ChosenFrame
 from gcar_deploy.types import Image, Mask
 
 if TYPE_CHECKING:  # only a name in annotations: pictures need no scene file
@@ -40,6 +41,8 @@ class Angiogram:
         Vessel as the user says; it wins over anything found in the pixels.
     erased, painted : (rows, cols) bool or None
         What the user takes from, and adds to, the vessels that are found.
+    frame : ChosenFrame or None
+        Which frame of a run it is, where the program chose it.
     """
 
     view_id: str
@@ -52,6 +55,7 @@ class Angiogram:
     mask: Mask | None = None
     erased: Mask | None = None
     painted: Mask | None = None
+    frame: ChosenFrame | None = None
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)

@@ -122,7 +122,7 @@ def _check_inflated(
 
 
 def check_tiff(data: bytes, smallest: int, largest: int) -> int:
-    """Read the first directory of a TIFF file; return its bit depth.
+    """Read the only directory of a TIFF file; return its bit depth.
 
     Raises
     ------
@@ -131,9 +131,56 @@ def check_tiff(data: bytes, smallest: int, largest: int) -> int:
         32 bit floating-point grey, a palette or inverted grey, sides out of range.
     """
     order = "<" if data[:2] == b"II" else ">"
-    tags, next_page = _tiff_directory(data, order)
+    tags, next_page = _tiff_directory(data, order, _first_page(data, order))
     if next_page:
         raise ValueError("holds several pages; export the one frame to be used")
+    return _check_tiff_page(data, tags, smallest, largest)[0]
+
+
+def check_tiff_pages(
+    data: bytes, smallest: int, largest: int, most: int
+) -> tuple[int, tuple[int, int], int]:
+    """Read all directories of a TIFF file; return bit depth, (rows, columns) and their number.
+
+    Raises
+    ------
+    ValueError
+        As ``check_tiff`` of any page; more than ``most`` pages, or pages that differ in size.
+    """
+    order = "<" if data[:2] == b"II" else ">"
+    at, seen, kinds = _first_page(data, order), 0, set()
+    while at:
+        seen += 1
+        if seen > most:
+            raise ValueError(f"holds more than {most} pages, or runs in a circle")
+        tags, at = _tiff_directory(data, order, at)
+        kinds.add(_check_tiff_page(data, tags, smallest, largest))
+    if len(kinds) != 1:
+        raise ValueError("holds pages of several sizes; export the frames of one run alone")
+    ((depth, size),) = kinds
+    return depth, size, seen
+
+
+def has_pages(data: bytes) -> bool:
+    """Tell whether a TIFF file names more than one page; it may be damaged otherwise."""
+    try:
+        order = "<" if data[:2] == b"II" else ">"
+        return bool(_tiff_directory(data, order, _first_page(data, order))[1])
+    except ValueError:
+        return False
+
+
+def _first_page(data: bytes, order: str) -> int:
+    if len(data) < 8:
+        raise ValueError("is truncated or damaged; copy or export it again")
+    (at,) = struct.unpack_from(order + "I", data, 4)
+    return int(at)
+
+
+def _check_tiff_page(
+    data: bytes, tags: dict[int, tuple[int, ...]], smallest: int, largest: int
+) -> tuple[int, tuple[int, int]]:
+    """Return bit depth and (rows, columns) of one page."""
     rows, columns = _one(tags, 257, 0), _one(tags, 256, 0)
     check_sides(rows, columns, smallest, largest)
     depths, formats = set(tags.get(258, (1,))), set(tags.get(339, (_UNSIGNED,)))
@@ -148,7 +195,7 @@ def check_tiff(data: bytes, smallest: int, largest: int) -> int:
     if not 1 <= _one(tags, 277, 1) <= (1 if 32 in depths else 4):
         raise ValueError("has an invalid number of channels; export it as 8 or 16 bit grey")
     _check_tiff_data(data, tags, rows * columns)
-    return depths.pop()
+    return depths.pop(), (rows, columns)
 
 
 def _check_tiff_data(data: bytes, tags: dict[int, tuple[int, ...]], pixels: int) -> None:
@@ -169,9 +216,9 @@ def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int) -> int:
     return values[0] if values else default
 
 
-def _tiff_directory(data: bytes, order: str) -> tuple[dict[int, tuple[int, ...]], int]:
+def _tiff_directory(data: bytes, order: str, at: int) -> tuple[dict[int, tuple[int, ...]], int]:
+    """Return the tags of the directory at ``at``, and where the next one is (0: none)."""
     try:
-        (at,) = struct.unpack_from(order + "I", data, 4)
         (entries,) = struct.unpack_from(order + "H", data, at)
         if entries > _MAX_TIFF_ENTRIES:
             raise ValueError("is damaged (too many TIFF tags); export it again")

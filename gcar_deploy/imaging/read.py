@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gcar_deploy.config import PictureLimits
+from gcar_deploy.config import DicomLimits, PictureLimits
 from gcar_deploy.errors import ImageError
 from gcar_deploy.files import read_bounded
 from gcar_deploy.imaging import png_guard
@@ -24,6 +24,8 @@ _JPEG_SIGNATURE = b"\xff\xd8\xff"
 _HEADER = (MemoryError, RecursionError, OverflowError)
 _NPY_DEPTH = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 _TYPE_OF = {8: np.uint8, 16: np.uint16, 32: np.float32}
+#: a multi-page file that is larger is no run
+_MOST_STACK_BYTES = DicomLimits().max_bytes
 _SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
 
 
@@ -59,6 +61,58 @@ def read_picture(path: str | Path, limits: PictureLimits | None = None) -> tuple
     sha256 = hashlib.sha256(data).hexdigest()
     _log.debug("read %d bytes, %s, %d bit, sha256 %s", len(data), pixels.shape, depth, sha256)
     return pixels, depth, sha256
+
+
+def is_stack(path: str | Path) -> bool:
+    """Whether a file is a TIFF of several pages; False for what cannot be read."""
+    path = Path(path)
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return False
+    try:
+        data = read_bounded(path, _MOST_STACK_BYTES)
+    except ValueError:
+        return False
+    return _sniff(data) == "TIFF" and png_guard.has_pages(data)
+
+
+def read_stack(path: str | Path, limits: DicomLimits) -> tuple[list[Image], int, str]:
+    """Read the pages of a TIFF, the frames of a run; see ``read_picture``.
+
+    Parameters
+    ----------
+    limits : DicomLimits, what a run may be
+
+    Returns
+    -------
+    pages : (rows, cols) float32 each
+    bit_depth, sha256
+
+    Raises
+    ------
+    ImageError
+    """
+    path = Path(path)
+    try:
+        data = read_bounded(path, min(limits.max_bytes, _MOST_STACK_BYTES))
+        depth, (rows, columns), count = png_guard.check_tiff_pages(
+            data, limits.min_side, limits.max_side, limits.max_frames
+        )
+        if rows * columns * count > limits.max_pixels:
+            raise ValueError(f"holds {count} pages of {columns} x {rows} pixels, which is too much")
+        try:
+            done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            done, pages = False, ()
+        if not done or len(pages) != count or any(p.dtype != _TYPE_OF[depth] for p in pages):
+            raise ValueError("cannot be decoded (damaged or unusual); export its frames as PNG")
+        grey = [_one_channel(page) for page in pages]
+        for page in grey:
+            if page.shape != (rows, columns):
+                raise ValueError("holds pages of several sizes")
+            _check_counts(page)
+    except ValueError as error:
+        raise ImageError(f"{path.name}: {error}") from None
+    return [page.astype(np.float32) for page in grey], depth, hashlib.sha256(data).hexdigest()
 
 
 def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Image, int]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gcar_deploy.config import ImagingOptions, PictureLimits, RunOptions
 from gcar_deploy.dicom.header import is_dicom
-from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, wanted_frames
+from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
@@ -22,6 +22,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.inputs.drawn import Drawn
+from gcar_deploy.inputs.runs import find_runs, together
 
 #: a file, an array of counts, or a picture that already knows its C-arm
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
@@ -151,15 +152,22 @@ def _by_scene(
         )
     notes = list(scene.warnings)
     angiograms = []
-    frames = _frames_for(views, options)
-    for picture, view in zip(views, scene.views, strict=True):
+    runs = find_runs(views, options)
+    chosen = together(runs, scene, options)
+    for number, (picture, view) in enumerate(zip(views, scene.views, strict=True), start=1):
         if isinstance(picture, Angiogram):
             angiograms.append(picture)
         elif isinstance(picture, (str, Path)) and is_dicom(picture):
-            run = read_run(picture, options.dicom, frames.pop(0))
+            run = read_run(picture, options.dicom, chosen.get(number, runs.wanted[number]))
             carm = _matched(view, run.pixels.shape, options.imaging, notes)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
             notes += [f"view {view.id}: {note}" for note in run.notes]
+        elif number in runs.cines:
+            *read, frame = runs.frame(number, chosen)
+            made = _as_angiogram(read, view, options.imaging, notes)
+            angiograms.append(dataclasses.replace(made, frame=frame))
+            if frame is not None:
+                notes.append(f"view {view.id}: frame {frame.number} of {frame.of}: {frame.reason}")
         else:
             angiograms.append(_angiogram(picture, view, options.imaging, notes))
     return angiograms, scene.volume_grid(), notes
@@ -170,9 +178,17 @@ def _angiogram(
 ) -> Angiogram:
     """Read a picture file, or take an array; what was rescaled is added to ``notes``."""
     if isinstance(picture, np.ndarray):
-        pixels, depth, sha256 = _from_array(view.id, picture, options.limits)
+        read = _from_array(view.id, picture, options.limits)
     else:
-        pixels, depth, sha256 = read_picture(picture, options.limits)
+        read = read_picture(picture, options.limits)
+    return _as_angiogram(read, view, options, notes)
+
+
+def _as_angiogram(
+    read: Sequence[Any], view: View, options: ImagingOptions, notes: list[str]
+) -> Angiogram:
+    """Pair pixels, bit depth and SHA-256 with their view."""
+    pixels, depth, sha256 = read
     return Angiogram(
         view_id=view.id, carm=_matched(view, pixels.shape, options, notes), pixels=pixels,
         bit_depth=depth, intensity=view.intensity, sha256=sha256,
@@ -191,14 +207,9 @@ def _from_headers(
             )
     if len(paths) != len(views):
         raise UsageError("pictures in memory tell no geometry: give a scene")
-    angiograms, scene, notes = read_views(paths, options.dicom)
+    chosen = together(find_runs(paths, options), None, options)
+    angiograms, scene, notes = read_views(paths, options.dicom, chosen)
     return angiograms, scene.volume_grid(), notes
-
-
-def _frames_for(views: Sequence[Picture], options: RunOptions) -> list[int | None]:
-    """Frame of each DICOM file among the pictures, in their order."""
-    runs = sum(isinstance(view, (str, Path)) and is_dicom(view) for view in views)
-    return list(wanted_frames(options.dicom, runs)) if runs else []
 
 
 def _matched(view: View, shape: tuple[int, ...], options: ImagingOptions, notes: list[str]) -> CArm:

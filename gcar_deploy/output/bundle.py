@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output.folder import listed, write_folder
+from gcar_deploy.output.frame_pictures import frame_png
 from gcar_deploy.output.glb import glb_bytes
 from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
@@ -70,6 +71,9 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
     for number, (dimmed, view, judged) in enumerate(drawn, start=1):
         picture = overlay(dimmed, view, result.tree, judged, ghosts)
         files[f"overlay_view{number}.png"] = png_bytes(picture)
+    for number, angiogram in enumerate(result.angiograms, start=1):
+        if angiogram.frame is not None:
+            files[f"frame_view{number}.png"] = frame_png(angiogram)
     summary = result.summary()
     pictures = [dimmed.picture for dimmed in behind]
     files["report.html"] = report_html(result, summary, pictures).encode("utf-8")

@@ -50,12 +50,29 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
             f"views are {angle:.1f} deg apart (folded to 0 .. 90); at least "
             f"{options.min_separation_deg:g} deg are needed to see depth"
         )
+    findings = _frame_findings(angiograms, options)
     if angle < options.good_separation_deg:
-        return [
+        findings.append(
             f"views are only {angle:.1f} deg apart (folded to 0 .. 90): depth is uncertain below "
             f"{options.good_separation_deg:g} deg"
-        ]
-    return []
+        )
+    return findings
+
+
+def _frame_findings(angiograms: Sequence[Angiogram], options: QualityOptions) -> list[str]:
+    """Frames of runs that may show the heart in two phases."""
+    frames = [a.frame for a in angiograms if a.frame is not None and a.frame.pair is not None]
+    least = min(
+        (f.pair.margin for f in frames if f.pair is not None and f.pair.margin is not None),
+        default=np.inf,
+    )
+    if least >= options.good_frame_margin:
+        return []
+    return [
+        f"the frames may show two phases of the heart: a pair that shows another shape agrees "
+        f"nearly as well (margin {least:.3f}, {options.good_frame_margin:g} is asked for); "
+        "see gcar frames"
+    ]
 
 
 def kind_of(views: Sequence[VesselImage]) -> str:

@@ -7,21 +7,22 @@ import functools
 import json
 import secrets
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gcar_deploy.config import PictureLimits, RunOptions
-from gcar_deploy.dicom.frames import Frames
-from gcar_deploy.dicom.header import is_dicom, read_header
+from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.files import read_text
+from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.geometry.scene import Scene, View, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.frame import ChosenFrame
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.vessels import Vessels
 from gcar_deploy.inputs.order import Order, order_to_json, parse_order
@@ -57,6 +58,7 @@ class Case:
     vessels : found by the last run, refused or not, in the order of the views; empty before
     pair_scores : numbers of two views, from 1, the lower first -> (n, m) how well each frame of
         the one goes with each of the other, 0 .. 1; empty where nobody judged pairs
+    proposed : number of a view -> frame that was chosen together with that of another view
     """
 
     def __init__(self, folder: Path, order: Order) -> None:
@@ -66,6 +68,7 @@ class Case:
         self.job_id: str | None = None
         self.vessels: tuple[VesselImage, ...] = ()
         self.pair_scores: dict[tuple[int, int], Array] = {}
+        self.proposed: dict[int, ChosenFrame] = {}
         self._frame: OwnFrame | None = None
         self._read: tuple[str, tuple[tuple[Angiogram, ...], list[str]]] | None = None
         self._lock = threading.Lock()
@@ -123,7 +126,7 @@ class Case:
             "order_file": str(self.order_file), "names": [p.name for p in self.order.views],
             "views": [], "notes": [], "geometry": None, "problem": None, "sizes": None,
             "job": self.job_id, "result": self.result is not None,
-            "dicom": [is_dicom(path) for path in self.ready_order.views],
+            "dicom": [is_dicom(path) or is_cine(path) for path in self.ready_order.views],
         }  # fmt: skip
         try:
             angiograms, notes = self._prepared()
@@ -152,18 +155,19 @@ class Case:
                 out[str(b if number == a else a)] = np.round(own, 3).tolist()
         return out
 
-    def run_of(self, number: int) -> Frames:
-        """Return the frames of view ``number`` (from 1).
+    def run_of(self, number: int) -> Cine | None:
+        """Return the frames of view ``number`` (from 1); None of a file with one frame.
 
         Raises
         ------
         UsageError
-            There is no such view, or it is no DICOM run.
+            There is no such view, or it is no run.
         """
         views = self.ready_order.views
-        if not 1 <= number <= len(views) or not is_dicom(views[number - 1]):
-            raise UsageError(f"view {number} is no DICOM run")
-        return _frames(views[number - 1])
+        path = views[number - 1] if 1 <= number <= len(views) else None
+        if path is None or not (is_dicom(path) or is_cine(path)):
+            raise UsageError(f"view {number} is no run")
+        return _frames(path)
 
     def _prepared(self) -> tuple[tuple[Angiogram, ...], list[str]]:
         order = self.ready_order
@@ -174,11 +178,24 @@ class Case:
                 order.views, order.geometry, order.options(RunOptions()), order.masks
             )
             self._read = what, (tuple(found), notes)
+            self._keep_pairs(found)
         return self._read[1]
+
+    def _keep_pairs(self, angiograms: Sequence[Angiogram]) -> None:
+        """Remember how the frames of two runs go together, also when one is then chosen by hand."""
+        for k, angiogram in enumerate(angiograms, start=1):
+            frame = angiogram.frame
+            if frame is None or frame.pair is None or frame.partner is None:
+                continue
+            self.proposed[k] = frame
+            low, high = sorted((k, frame.partner))
+            self.pair_scores[low, high] = np.clip(frame.pair.scores, 0.0, 1.0)
 
     def _sizes(self) -> list[tuple[int, int]] | None:
         """(rows, columns) of pictures whose geometry nobody tells; None where it is told."""
-        if self.order.geometry is not None or any(map(is_dicom, self.ready_order.views)):
+        if self.order.geometry is not None or any(
+            is_dicom(path) or is_cine(path) for path in self.ready_order.views
+        ):
             return None
         try:
             found = [read_picture(p, PictureLimits())[0] for p in self.ready_order.views]
@@ -206,5 +223,5 @@ _READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm"
 
 
 @functools.lru_cache(maxsize=8)
-def _frames(path: Path) -> Frames:
-    return Frames(read_header(path, RunOptions().dicom.limits))
+def _frames(path: Path) -> Cine | None:
+    return open_cine(path, RunOptions())

@@ -172,22 +172,34 @@ def _pictures(app: Flask, desk: Desk) -> None:
 
     @app.get("/api/cases/<case_id>/views/<int:view>/frames")
     def frames(case_id: str, view: int) -> Any:
-        run = _case(desk, case_id).run_of(view)
-        if len(run) == 1:
+        case = _case(desk, case_id)
+        run = case.run_of(view)
+        if run is None or len(run) == 1:
             return {"frames": 1, "chosen": 1, "reason": "the only one", "filling": [1.0],
-                    "motion": [0.0], "pairs": {}}  # fmt: skip
+                    "motion": [0.0], "pairs": {}, "with": {}}  # fmt: skip
         filling, motion = filling_and_motion(run)
-        choice = choose_frame(run, None)
+        frame = case.proposed.get(view)
+        if frame is None:
+            choice = choose_frame(run, None)
+            chosen, reason = choice.index + 1, choice.reason
+        else:
+            chosen, reason = frame.number, frame.reason
         return {
-            "frames": len(run), "chosen": choice.index + 1, "reason": choice.reason,
+            "frames": len(run), "chosen": chosen, "reason": reason,
             "filling": filling.tolist(), "motion": (motion / max(motion.max(), 1e-9)).tolist(),
-            "pairs": _case(desk, case_id).scores_with(view),
+            "pairs": case.scores_with(view),
+            "with": {str(k): frame.number for k, frame in case.proposed.items() if k != view},
         }  # fmt: skip
 
     @app.get("/api/cases/<case_id>/views/<int:view>/frames/<int:frame>.png")
     def frame_of(case_id: str, view: int, frame: int) -> Any:
-        run = _case(desk, case_id).run_of(view)
-        return _png(thumbnail_png(run.decode(_place(frame, len(run), "frame")), _THUMBNAIL_PX))
+        case = _case(desk, case_id)
+        run = case.run_of(view)
+        if run is None:
+            pixels = case.angiograms()[_place(view, len(case.angiograms()))].pixels
+        else:
+            pixels = run.decode(_place(frame, len(run), "frame"))
+        return _png(thumbnail_png(pixels, _THUMBNAIL_PX))
 
     @app.post("/api/cases/<case_id>/views/<int:view>/epipolar")
     def lines(case_id: str, view: int) -> Any:

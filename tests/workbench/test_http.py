@@ -192,3 +192,36 @@ def test_scores_of_frame_pairs_are_told_from_either_view(ask, desk):
     case.pair_scores[1, 2] = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     assert case.scores_with(1) == {"2": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]}
     assert case.scores_with(2) == {"1": [[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]}
+
+
+def test_frames_of_two_runs_come_with_how_they_go_together(ask, desk, tmp_path):
+    import cv2
+
+    from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
+    from gcar_deploy.inputs.order import Order
+    from gcar_export.scenes.cine import cine_pair
+    from gcar_export.studies.frame_pairs import CHOSEN_ON
+
+    made = cine_pair(CHOSEN_ON, 3)
+    views = []
+    for k, run in enumerate(made.runs, start=1):
+        cv2.imwritemulti(str(tmp_path / f"run{k}.tif"), list(run.pixels))
+        views.append(View(id=str(k), carm=run.carm, intensity=Intensity(kind="raw")))
+    (tmp_path / "geom.json").write_text(scene_to_json(Scene(views=tuple(views))))
+    order = Order(
+        views=(tmp_path / "run1.tif", tmp_path / "run2.tif"), geometry=tmp_path / "geom.json"
+    )
+    case = desk.add(desk.new_folder("cine"), order)
+    told = ask("GET", f"/api/cases/{case.id}").json
+    assert told["problem"] is None and told["dicom"] == [True, True]
+    first, second = (ask("GET", f"/api/cases/{case.id}/views/{k}/frames").json for k in (1, 2))
+    assert first["frames"] == 15 and first["with"] == {"2": second["chosen"]}
+    assert made.phase_error()[first["chosen"] - 1, second["chosen"] - 1] * 8 <= 1
+    scores = first["pairs"]["2"]
+    assert scores[first["chosen"] - 1][second["chosen"] - 1] > 0.5
+    assert second["pairs"]["1"][0][2] == scores[2][0]
+    shown = ask("GET", f"/api/cases/{case.id}/views/1/frames/3.png")
+    assert shown.status_code == 200 and shown.data.startswith(b"\x89PNG")
+    # A frame chosen by hand keeps the scores.
+    assert ask("PUT", f"/api/cases/{case.id}/order", json={"frames": [3, 4]}).status_code == 200
+    assert ask("GET", f"/api/cases/{case.id}/views/1/frames").json["pairs"]["2"] == scores

@@ -1,4 +1,4 @@
-// Frames of DICOM runs with what speaks for each: contrast and stillness.
+// Frames of runs with what speaks for each: contrast and stillness.
 import * as api from "./api.js";
 import { $, el } from "./dom.js";
 
@@ -20,10 +20,11 @@ function bar(kind, share) {
   return meter;
 }
 /** Scores of this run's frames with the frame that another view shows now; null where nobody judged pairs. */
-function partner(store, pairs) {
-  const [view, scores] = Object.entries(pairs)[0] ?? [];
+function partner(store, told) {
+  const [view, scores] = Object.entries(told.pairs)[0] ?? [];
   const frames = store.info.order.frames;
-  const now = view && frames && (frames.length === 1 ? frames[0] : frames[view - 1]);
+  const asked = view && frames && (frames.length === 1 ? frames[0] : frames[view - 1]);
+  const now = asked ?? told.with?.[view];
   return now ? scores.map(row => row[now - 1]) : null;
 }
 
@@ -32,7 +33,7 @@ async function strip(store, say, k) {
   const order = store.info.order.frames;
   const asked = order && (order.length === 1 ? order[0] : order[k]);
   const now = asked ?? told.chosen;
-  const with_ = partner(store, told.pairs);
+  const with_ = partner(store, told);
   const near = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(async one => {
     near.unobserve(one.target);
     one.target.src = await api.imageUrl(`${path}/${one.target.dataset.frame}.png`);

@@ -1,0 +1,1 @@
+"""Which frames of cine runs go together: contrast, stillness, heart phase."""
