@@ -21,8 +21,8 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
     Their errors have little in common: the one follows any line, however faint, and its contrast
     holds all that lies there; the other knows what a vessel looks like, at whatever size. The
     classical paths are first brought to the scale of the network's, which is the better known.
-    A catheter has the contrast of a vessel, so that the network takes many for one; by its course
-    the classical method knows some of them.
+    A catheter has the contrast of a vessel, so that either method takes many for one: what one of
+    them knows for a catheter leaves both.
 
     Parameters
     ----------
@@ -32,8 +32,7 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
     -------
     VesselImage ; its ``others`` are ``learned`` and ``classic``
     """
-    if classic.catheter is not None and classic.catheter.any():
-        learned = _without(learned, classic.catheter)
+    classic, learned = _without(classic, learned.catheter), _without(learned, classic.catheter)
     ours, theirs = classic.path_mm.astype(np.float64), learned.path_mm.astype(np.float64)
     both = (ours > 0) & (theirs > 0)
     power = float((ours[both] ** 2).sum())
@@ -47,8 +46,10 @@ def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
     )
 
 
-def _without(view: VesselImage, device: Mask) -> VesselImage:
+def _without(view: VesselImage, device: Mask | None) -> VesselImage:
     """Cut the lines that lie on a device, as wide as they are."""
+    if device is None or not device.any():
+        return view
     line = view.skeleton
     on_it = line & (cv2.dilate(device.astype(np.uint8), _NEAR) > 0)
     left = line & ~on_it

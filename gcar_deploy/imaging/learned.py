@@ -16,7 +16,8 @@ import numpy as np
 
 from gcar_deploy.imaging import enhance, segment
 from gcar_deploy.imaging import skeleton as skel
-from gcar_deploy.imaging.net import Seen, Segmenter, at_network_size, net_input
+from gcar_deploy.imaging.catheter import catheters
+from gcar_deploy.imaging.net import NOMINAL_MM, Seen, Segmenter, at_network_size, net_input
 from gcar_deploy.types import Image, Mask
 
 #: hysteresis on the network's probability: what is faint counts where it touches what is sure
@@ -65,7 +66,8 @@ def learned_vessels(
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
     seen = segmenter.look(net_input(work, work_holes))
-    other = work_holes | (seen.device > seen.probability)
+    shaft = shafts(seen, work, work_holes)
+    other = work_holes | shaft | (seen.device > seen.probability)
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]
     finer = float(np.sqrt(search.size / work.size))
@@ -78,7 +80,7 @@ def learned_vessels(
     near = _with_contrast(near, chord, contrast, finer)
     path = np.where(near, 0.5 * (chord + contrast), 0).astype(np.float32)
     mask = _drawn(path, near, finer)
-    device = _devices(seen, sure)
+    device = (_devices(seen, sure) | shaft) & ~sure
     found = dataclasses.replace(
         segment.given(search, mask, holes, pixel_mm),
         vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
@@ -86,6 +88,25 @@ def learned_vessels(
         catheter_mm=int(skel.skeletonize(device).sum()) * float(work_mm),
     )
     return found, path
+
+
+def shafts(seen: Seen, picture: Image, holes: Mask) -> Mask:
+    """(rows, cols) bool: lines of vessels and devices that are catheters, leads or wires by course.
+
+    The network takes parts of a catheter for a device and parts for a vessel: its course is that
+    of both together. Pixels are taken for as large as the network's filters take them.
+    """
+    either = np.where(holes, np.float32(0), np.maximum(seen.probability, seen.device))
+    reach = skel.parts_touching(either >= LEVELS[0], either >= LEVELS[1])
+    line = skel.prune(skel.skeletonize(reach), either, SPUR_PX, 0.0)
+    if not line.any():
+        return np.zeros_like(reach)
+    filled = enhance.fill_holes(picture, holes)
+    flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / NOMINAL_MM)
+    sigma_px = enhance.ridges(flat, NOMINAL_MM).sigma_px
+    taken = catheters(line, flat, sigma_px, ~holes, NOMINAL_MM)
+    left = skel.beside(reach, line, line & ~taken)
+    return skel.beside(reach, line, taken) & ~left
 
 
 def support(seen: Seen, levels: tuple[float, float]) -> Mask:

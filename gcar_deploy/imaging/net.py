@@ -39,7 +39,7 @@ OUTPUTS = ("probability", "chord", "device")
 #: the second flattening is this much wider than the first: borders of lung and heart stay
 _WIDER = 4.0
 #: the filters take a pixel of the network for so much: most fields are near 352 times it
-_NOMINAL_MM = 0.5
+NOMINAL_MM = 0.5
 #: a picture without noise has no spread: the unit is at least this share of its brightest lines
 _LEAST_UNIT = 0.05
 
@@ -69,9 +69,9 @@ def net_input(picture: Image, holes: Mask) -> Array:
         0 where there is no picture. A gain or an offset of ``picture`` changes nothing.
     """
     filled = enhance.fill_holes(picture, holes)
-    sigma = enhance.FLATTEN_SIGMA_MM / _NOMINAL_MM
+    sigma = enhance.FLATTEN_SIGMA_MM / NOMINAL_MM
     flat = enhance.flatten(filled, sigma)
-    response = np.where(holes, np.float32(0), enhance.ridges(flat, _NOMINAL_MM).response)
+    response = np.where(holes, np.float32(0), enhance.ridges(flat, NOMINAL_MM).response)
     inside = ~holes if not holes.all() else np.ones_like(holes)
     low, middle, bright = np.percentile(flat[inside], [16, 50, 99.5])
     top = float(np.percentile(response[inside], 99))

@@ -13,7 +13,9 @@ from scipy.interpolate import CubicSpline
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import catheter, segment
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.learned import shafts
 from gcar_deploy.imaging.linegraph import LineGraph
+from gcar_deploy.imaging.net import Seen
 from gcar_deploy.imaging.pictures import vessel_pictures
 from gcar_deploy.imaging.resample import resized
 from gcar_deploy.imaging.skeleton import skeletonize
@@ -102,6 +104,35 @@ def test_a_vessel_that_leaves_the_field_stays(name, seed):
     found, kept = _found(_LEAVING[name], seed=seed), _kept(_LEAVING[name], seed)
     assert found.catheter_mm == 0 and not found.catheter.any()
     np.testing.assert_array_equal(found.mask, kept.mask)
+
+
+def _seen(tubes, device):
+    """What a network would say of tubes of which it takes those of ``device`` for no vessel."""
+    path = _tubes(tubes)
+    other = (_tubes([device]) > 0.4) if device else np.zeros(path.shape, bool)
+    said = np.where(path > 0.4, np.float32(0.9), np.float32(0.02))
+    return Seen(np.where(other, np.float32(0.1), said), path, np.where(other, said, np.float32(0)))
+
+
+def test_a_shaft_in_parts_vessel_and_device_has_one_course():
+    (above, shaft, *_), radius, _ = _CATHETERS["from above"]
+    tubes = (*_TREE, _CATHETERS["from above"])
+    picture = -np.log(raw_picture(_tubes(tubes)))
+    none = np.zeros(picture.shape, bool)
+    gone = shafts(_seen(tubes, ([above, shaft], radius, radius)), picture, none)
+    row, column = np.indices(none.shape)
+    away = np.hypot(column - 78, row - 70) * _MM > 5.0
+    own = skeletonize(_tubes([_CATHETERS["from above"]]) > 0) & away
+    vessel = skeletonize(_tubes(_TREE) > 0) & away
+    assert (gone & own).sum() > 0.9 * own.sum()
+    assert not (gone & vessel).any()
+
+
+@pytest.mark.parametrize("name", sorted(_LEAVING))
+def test_a_vessel_of_the_network_that_leaves_the_field_stays(name):
+    picture = -np.log(raw_picture(_tubes(_LEAVING[name])))
+    gone = shafts(_seen(_LEAVING[name], None), picture, np.zeros(picture.shape, bool))
+    assert not gone.any()
 
 
 def test_a_lead_across_the_field_goes():

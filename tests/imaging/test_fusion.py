@@ -43,6 +43,17 @@ def test_a_catheter_that_one_method_knows_leaves_mask_and_path():
     assert not (both.others[0].mask & shaft & away).any()
 
 
+def test_a_catheter_that_the_network_knows_leaves_the_classical_path():
+    shaft, vessel = drawn(SHAFT), drawn(VESSEL)
+    both = fused(seen(shaft | vessel, np.zeros_like(shaft)), seen(vessel, shaft & ~vessel))
+    away = np.hypot(*(np.indices(shaft.shape) - np.array([50, 60])[:, None, None])) > 9
+    assert (
+        not (both.path_mm[shaft & away] > 0).any()
+        and not (both.others[1].mask & shaft & away).any()
+    )
+    assert (both.path_mm[vessel & away] > 0).all()
+
+
 def test_without_a_catheter_both_paths_are_averaged():
     vessel = drawn(VESSEL)
     none = np.zeros_like(vessel)
