@@ -18,6 +18,7 @@ from gcar_deploy.types import Array
 from gcar_export.studies.phantom import NEAR_PX, Fit, Phantom
 
 _FITTED, _PREDICTED, _SKELETON = (80, 220, 80), (40, 200, 255), (255, 120, 60)
+_DEVICE = (60, 60, 255)
 
 
 def markdown(fits: Sequence[Fit]) -> str:
@@ -62,8 +63,9 @@ def write_page(phantom: Phantom, fits: Sequence[Fit], out: Path) -> Path:
         "figure{display:inline-block;margin:0 12px 12px 0;width:370px;vertical-align:top}"
         "img{width:370px}pre{overflow:auto}</style>",
         "<h1>Real X-rays of a physical coronary phantom</h1>",
-        "<p>Data: Vukicevic et al., Sci Rep 8:1711 (2018), Dataset I. Orange: skeleton found in "
-        "the picture. Green: tree in a run that it was fitted to. Yellow: tree in a run that it "
+        "<p>Data: Vukicevic et al., Sci Rep 8:1711 (2018), Dataset I. Blue: skeleton found in "
+        "the picture. Red: taken for a catheter or wire and left out. "
+        "Green: tree in a run that it was fitted to. Yellow: tree in a run that it "
         "never saw, after one shift of the run as a whole. The authors report 0.03 to 2.46 mm "
         "between their surface and CT.</p>",
         f"<pre>{html.escape(markdown(fits))}</pre>",
@@ -110,8 +112,10 @@ def _figure(
 def draw(
     pixels: Array, view: VesselImage, carm: CArm, tree: Tree, color: tuple[int, int, int]
 ) -> Array:
-    """(rows, cols, 3) uint8: picture, its skeleton, the tree as ``carm`` sees it."""
+    """(rows, cols, 3) uint8: picture, its skeleton, catheter, the tree as ``carm`` sees it."""
     canvas = cv2.cvtColor((0.7 * grey8(pixels)).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    if view.catheter is not None:
+        canvas[view.catheter] = _DEVICE
     canvas[view.skeleton & view.valid] = _SKELETON
     for branch in tree.branches:
         line = np.clip(carm.project(branch.points_mm)[0], -4000, 4000)

@@ -19,7 +19,7 @@ from gcar_deploy.types import Array, Mask
 _BOTH, _ALONE, _MISSED, _DEVICE = (60, 200, 60), (60, 90, 255), (255, 130, 70), (0, 170, 255)
 _LEGEND = (
     "Left: the picture. Right: green found and drawn by the expert, red found alone, blue drawn "
-    "alone, orange taken for a catheter, lead or wire."
+    "alone, orange taken for a catheter, lead or wire, black the centreline."
 )
 
 
@@ -62,4 +62,5 @@ def marked(grey: Array, found: VesselImage, truth: Mask) -> Array:
         areas.append((found.catheter, _DEVICE))
     for area, colour in areas:
         drawn[area] = (0.45 * drawn[area] + 0.55 * np.array(colour)).astype(np.uint8)
+    drawn[found.skeleton] = 0
     return np.hstack([plain, drawn])

@@ -5,7 +5,7 @@
 ``DIR`` holds ``xca_masks`` (``N.png`` with ``N_gt.png``; at its top or under ``data/``) and
 ``cases`` (``R_*``: raw pictures; ``C_*``: the same views as noise-free path lengths). ``--model``
 once per fold of a cross-validation scores each expert-masked picture by the model that left it
-out. A third table is of generated pictures, trivial to hard.
+out. A third table is of generated pictures, trivial to hard, a fourth of forty with a catheter.
 """
 
 from __future__ import annotations
@@ -39,6 +39,10 @@ from gcar_export.studies.segmentation_page import write_page
 TRUTH_MM = 0.4
 #: a centreline is found where one is within so many pixels
 NEAR_PX = 2
+#: generated pictures with a catheter
+CATHETERS = 40
+#: what ``generated_score`` says of the catheter
+LEFT = ("catheter left", "in paths")
 #: sizes of a pixel that are claimed for a generated picture, as multiples of the true one
 CLAIMED = (0.7, 1.0, 1.4)
 
@@ -73,6 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if len(nets) == 1:
         _print_cases(find(chosen.data, "cases"), nets[0], asked.who)
         _print_generated(nets[0], asked.who)
+        _print_catheters(nets[0], asked.who)
     return 0
 
 
@@ -209,7 +214,8 @@ def generated_score(
 ) -> tuple[str, dict[str, float]]:
     """Kind and scores of a generated picture whose pixels are claimed to be so many times as large.
 
-    ``catheter left``: share of the catheter's pixels that are in the mask.
+    ``catheter left``: share of the catheter's pixels that are in the mask; ``in paths``: that
+    have a path, so that the hull may hold them.
     """
     made = sanity_picture(number)
     picture = (made.pixels.astype(np.float32), 8, "")
@@ -219,10 +225,12 @@ def generated_score(
         found = extract_vessels(angiogram, ImagingOptions(segmenter=who), net)
     except RefusedError:
         nothing = np.zeros_like(made.mask)
-        return made.kind, mask_scores(nothing, nothing, made.mask) | {"catheter left": 0.0}
-    left = float((found.mask & made.catheter).sum()) / max(1, int(made.catheter.sum()))
+        return made.kind, mask_scores(nothing, nothing, made.mask) | dict.fromkeys(LEFT, 0.0)
+    areas = (found.mask, found.path_mm > 0)
+    count = max(1, int(made.catheter.sum()))
+    left = [float((area & made.catheter).sum()) / count for area in areas]
     scores = mask_scores(found.mask, found.skeleton, made.mask)
-    return made.kind, scores | {"catheter left": left}
+    return made.kind, scores | dict(zip(LEFT, left, strict=True))
 
 
 def _print_generated(net: Segmenter | None, who: SegmenterName) -> None:
@@ -240,6 +248,16 @@ def _print_generated(net: Segmenter | None, who: SegmenterName) -> None:
     for label, some in rows.items():
         means = {n: float(np.mean([r[n] for r in some])) for n in names}
         print(_line(label, means | {"lowest": min(r["Dice"] for r in some)}))
+
+
+def _print_catheters(net: Segmenter | None, who: SegmenterName) -> None:
+    numbers = [3 * EACH * (k // EACH) + 2 * EACH + k % EACH for k in range(CATHETERS)]
+    rows = [generated_score(number, net, who)[1] for number in numbers]
+    print(f"\n{CATHETERS} hard generated pictures, each with a catheter")
+    print("| | " + " | ".join(rows[0]) + " |")
+    print("|---" * (len(rows[0]) + 1) + "|")
+    print(_line("mean", {n: float(np.mean([r[n] for r in rows])) for n in rows[0]}))
+    print(_line("median", {n: float(np.median([r[n] for r in rows])) for n in rows[0]}))
 
 
 def _print_cases(cases: Path, net: Segmenter | None, who: SegmenterName) -> None:
