@@ -64,8 +64,10 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         )
     files = {name: make() for name, make in makers.items()}
     behind = [
-        backdrop(angiogram.pixels, missing)
-        for angiogram, missing in zip(result.angiograms, result.unexplained, strict=True)
+        backdrop(angiogram.pixels, missing, view.catheter)
+        for angiogram, missing, view in zip(
+            result.angiograms, result.unexplained, result.views, strict=True
+        )
     ]
     drawn = zip(behind, result.views, result.quality.views, strict=True)
     for number, (dimmed, view, judged) in enumerate(drawn, start=1):

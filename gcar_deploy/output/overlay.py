@@ -27,6 +27,8 @@ _SHIFT = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _BAR_MM = 20
 _WHITE, _BLACK, _RED = (255, 255, 255), (0, 0, 0), (60, 40, 255)
+#: catheters, leads and wires that were left out; no branch is grey
+_DEVICE = (200, 200, 200)
 _AROUND = tuple((dx, dy) for dx in (-2, -1, 0, 1, 2) for dy in (-2, -1, 0, 1, 2) if dx or dy)
 #: PNG by zlib's quickest, rows as they are: a third of the time, and a tenth more bytes
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
@@ -62,19 +64,22 @@ class Backdrop:
     zoom: int
 
 
-def backdrop(pixels: Image, missing: Mask) -> Backdrop:
+def backdrop(pixels: Image, missing: Mask, device: Mask | None = None) -> Backdrop:
     """Dim and enlarge a picture until it is at least 768 wide.
 
     Parameters
     ----------
     pixels : (rows, cols) float32 picture as it was given
     missing : (rows, cols) what the tree leaves unexplained, which becomes red
+    device : (rows, cols) what was taken for a catheter and left out, which becomes light grey
     """
     rows, columns = pixels.shape
     zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
     base = cv2.resize(grey8(pixels), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
     canvas = cv2.cvtColor((base * _DIM).astype(np.uint8), cv2.COLOR_GRAY2BGR)
-    _mark(canvas, missing, zoom)
+    if device is not None:
+        _mark(canvas, device, zoom, _DEVICE)
+    _mark(canvas, missing, zoom, _RED)
     return Backdrop(picture=canvas, zoom=zoom)
 
 
@@ -121,7 +126,8 @@ def overlay(
             cv2.polylines(canvas, [points], False, _BLACK, width + 1, cv2.LINE_8, _SHIFT)
     _numbers(canvas, lines)
     _labels(canvas, judged)
-    _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom, bool(doubtful))
+    device = view.catheter is not None and bool(view.catheter.any())
+    _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom, bool(doubtful), device)
     return canvas
 
 
@@ -161,13 +167,13 @@ def _gaps(line: Pixels, dash: float) -> list[Pixels]:
     return [along(line, arc, np.linspace(a, min(a + dash, arc[-1]), 6)) for a in starts]
 
 
-def _mark(canvas: Array, missing: Mask, zoom: int) -> None:
-    """Paint skeleton pixels that no branch explains."""
+def _mark(canvas: Array, missing: Mask, zoom: int, color: tuple[int, int, int]) -> None:
+    """Paint pixels of the picture."""
     size = (canvas.shape[1], canvas.shape[0])
     big = cv2.resize(missing.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     if zoom < 4:
         big = cv2.dilate(big, np.ones((3, 3), np.uint8))
-    canvas[big > 0] = _RED
+    canvas[big > 0] = color
 
 
 def _numbers(canvas: Array, lines: list[Pixels]) -> None:
@@ -193,7 +199,7 @@ def _labels(canvas: Array, judged: ViewQuality) -> None:
         _text(canvas, text, (14, round(62 * size)), 0.7 * size)
 
 
-def _legend(canvas: Array, pixel_mm: float, dashed: bool) -> None:
+def _legend(canvas: Array, pixel_mm: float, dashed: bool, device: bool) -> None:
     """Scale bar at the bottom left, meaning of the colours at the bottom right."""
     rows, columns = canvas.shape[:2]
     size = max(columns / 1600, 0.5)
@@ -204,6 +210,8 @@ def _legend(canvas: Array, pixel_mm: float, dashed: bool) -> None:
     entries = [("centreline, a colour a branch", branch_color(0)), ("vessel not explained", _RED)]
     if dashed:
         entries.insert(1, ("dashed: probably not there", branch_color(0)))
+    if device:
+        entries.append(("catheter or wire, left out", _DEVICE))
     step = round(34 * size)
     wide = max(_width(text, size) for text, _ in entries)
     for k, (text, color) in enumerate(entries):

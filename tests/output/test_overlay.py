@@ -130,3 +130,20 @@ def test_a_probable_ghost_is_dashed_and_told_in_the_legend():
     assert coloured(dashed, 47, 69).all()  # the other half is whole
     bottom = plain.shape[0] // 2
     assert (plain[bottom:] != dashed[bottom:]).any()
+
+
+def test_a_catheter_has_a_colour_and_a_line_in_the_legend():
+    view = blank_view()
+    tree = line_tree(view.carm)
+    device = np.zeros(view.mask.shape, bool)
+    device[20:23, 5:30] = True
+    pixels = np.zeros(view.mask.shape, np.float32)
+    with_it = dataclasses.replace(view, catheter=device)
+    picture = overlay(backdrop(pixels, view.mask, device), with_it, tree, JUDGED)
+    plain = overlay(backdrop(pixels, view.mask), view, tree, JUDGED)
+    zoom = picture.shape[1] // view.carm.columns
+    grey = (picture == 200).all(axis=2)
+    assert grey[20 * zoom : 23 * zoom, 5 * zoom : 30 * zoom].all()
+    assert not (plain[20 * zoom : 23 * zoom, 5 * zoom : 30 * zoom] == 200).all(axis=2).any()
+    bottom = plain.shape[0] // 2
+    assert (plain[bottom:] != picture[bottom:]).any()
