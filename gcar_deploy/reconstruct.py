@@ -115,6 +115,7 @@ def _reconstructed(
         placed = register(angiograms, vessels.views, options, tree_of)
         keep(placed)
         placed.or_refuse()
+        options = placed.marks(options)
     with watch.stage("candidates"), placed.hinting():
         seen = seen_by_all(placed.views, grid, options, predictor)
         keep(seen)
@@ -126,7 +127,10 @@ def _reconstructed(
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(),
         ).or_fail()  # fmt: skip
-        signals = [read_signal(a, v) for a, v in zip(angiograms, placed.views, strict=True)]
+        signals = [
+            read_signal(a, v)
+            for a, v in zip(placed.pictures(angiograms), placed.views, strict=True)
+        ]
         refined = refined.with_tree(joined_over_lesions(refined.tree, signals))
         refined, missed = refined.without(options.deleted_mm)
         keep(refined)

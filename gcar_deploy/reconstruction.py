@@ -57,7 +57,8 @@ class Reconstruction:
     gaussians : Gaussians
     volume : (nx, ny, nz) float32 vessel occupancy 0 .. 1 on ``grid``
     grid : Grid
-    angiograms : the pictures as they were given
+    angiograms : the pictures as they were given, but with the motion of the heart undone where any
+        was found
     views : what was found in them, with the geometry that was used (poses applied)
     poses : correction of each view; one of them, by the scene's own order, stays as it was told
     seconds : wall-clock seconds per stage, and ``total``
@@ -161,6 +162,7 @@ class Reconstruction:
             dataclasses.replace(self.views[p], carm=pose.applied(angiogram.carm))
             for p, pose, angiogram in zip(places, poses, angiograms, strict=True)
         )
+        stills = tuple(pose.still(a) for pose, a in zip(poses, angiograms, strict=True))
         judged = tuple(self.quality.views[p] for p in places)
         means = self.gaussians.means_mm + frame.origin_mm
         return dataclasses.replace(
@@ -168,7 +170,7 @@ class Reconstruction:
             quality=dataclasses.replace(self.quality, views=judged),
             tree=self.tree.moved(frame.origin_mm),
             gaussians=dataclasses.replace(self.gaussians, means_mm=means),
-            grid=grid, angiograms=tuple(angiograms), views=views, poses=poses, options=options,
+            grid=grid, angiograms=stills, views=views, poses=poses, options=options,
             close_calls=tuple(
                 dataclasses.replace(call, middle_mm=call.middle_mm + frame.origin_mm)
                 for call in self.close_calls
@@ -340,6 +342,7 @@ class Reconstruction:
             "estimated_primary_deg": pose.primary_deg,
             "estimated_secondary_deg": pose.secondary_deg,
             "pose_converged": pose.converged,
+            "motion_mm": pose.motion_mm,
         }
 
 

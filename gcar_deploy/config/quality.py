@@ -83,6 +83,9 @@ class QualityOptions:
     #: a larger estimated correction between the runs is no small matter of breath or table
     good_shift_mm: Length = 5.0
     good_turn_deg: Length = 1.5
+    #: a larger motion of the heart between the runs, beyond a shift (root mean square of what two
+    #: exact views see of it), leaves a tree bent by a millimetre and more
+    good_motion_mm: Length = 0.5
     #: A view asks for another angle or scale (``pose/significance.py``) where that lowers the
     #: disagreement to this share of what the best shift leaves, by so much at least, and the
     #: squared difference so many times. Chosen on generated raw and mask pairs

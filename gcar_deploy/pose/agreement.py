@@ -15,6 +15,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.landmarks import landmark_pixels
+from gcar_deploy.pose.motion import STILL, estimate_motion
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
 from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
@@ -112,6 +113,31 @@ def profiled(
         for (carm, path), v in zip(small, views, strict=True)
     ]
     return masses, _smoothing(views, options)
+
+
+def with_motion(
+    views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
+) -> tuple[Pose, ...]:
+    """Return the poses of two exact views with the motion of the heart between them, if any.
+
+    Where there is some, the correction is estimated anew together with it; see ``motion``.
+    """
+    exact = all(view.calibrated for view in views)
+    if len(views) != 2 or not (options.pose.enabled and exact) or poses[1].after <= STILL:
+        return tuple(poses)
+    masses, smoothing = profiled(views, options)
+    fixed, moving = masses
+    if poses[1].partner or fixed is None or moving is None:
+        return tuple(poses)
+    found = estimate_motion(fixed, moving, poses[1].theta, smoothing)
+    if found is None:
+        return tuple(poses)
+    (x, y, z, primary, secondary), motion, after = found
+    moved = dataclasses.replace(
+        poses[1], offset_mm=(float(x), float(y), float(z)), primary_deg=float(primary),
+        secondary_deg=float(secondary), after=after, motion=motion,
+    )  # fmt: skip
+    return poses[0], moved
 
 
 def _smoothing(views: Sequence[VesselImage], options: RunOptions) -> PoseOptions:

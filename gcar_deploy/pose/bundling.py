@@ -75,7 +75,9 @@ def bundled(
 
 
 def posed(view: VesselImage, pose: Pose) -> VesselImage:
-    """Return the view with its correction built in."""
+    """Return the view with its correction built in, and with the motion undone."""
+    if pose.motion is not None:
+        view = pose.motion.undone(view)
     carm = pose.applied(view.carm)
     return view if carm is view.carm else dataclasses.replace(view, carm=carm)
 

@@ -27,7 +27,9 @@ from gcar_deploy.geometry.consistency import (
 )
 from gcar_deploy.geometry.epipolar import plane_normal, ray_gaps
 from gcar_deploy.geometry.prior import LANDMARK_MM
+from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.pose.joint import corrected, estimate_jointly
+from gcar_deploy.pose.motion import Motion
 from gcar_deploy.pose.profile_fit import (
     MIN_GAIN,
     MOST_APART_DEG,
@@ -61,6 +63,8 @@ class Pose:
         Root mean square distance between the rays of the landmarks that both views show.
     converged : bool
         False where the correction is that of a fit that was stopped at its cap.
+    motion : Motion or None
+        Smooth motion of the heart beyond a shift, which is undone in this view's picture.
     """
 
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -72,6 +76,12 @@ class Pose:
     landmark_before_mm: float | None = None
     landmark_after_mm: float | None = None
     converged: bool = True
+    motion: Motion | None = None
+
+    @property
+    def motion_mm(self) -> float:
+        """Root mean square of the motion beyond a shift, as far as two views see it."""
+        return 0.0 if self.motion is None else self.motion.rms_mm
 
     @property
     def shift_mm(self) -> float:
@@ -86,6 +96,18 @@ class Pose:
     def applied(self, carm: CArm) -> CArm:
         """Return the view with the correction built in."""
         return corrected(carm, self.theta)
+
+    def still(self, angiogram: Angiogram) -> Angiogram:
+        """Return a picture with the motion undone."""
+        return angiogram if self.motion is None else self.motion.undone_picture(angiogram)
+
+    def still_at(self, carm: CArm, point: tuple[float, float]) -> tuple[float, float]:
+        """Return where a point (col, row) of the picture stands with the motion undone."""
+        if self.motion is None:
+            return point
+        (moved,) = np.array([point]) + self.motion.at(carm, np.array([point]))
+        column, row = np.clip(moved, 0.0, [carm.columns - 1.0, carm.rows - 1.0]).tolist()
+        return column, row
 
     @property
     def theta(self) -> Array:

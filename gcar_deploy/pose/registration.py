@@ -6,14 +6,14 @@ import contextlib
 import dataclasses
 from collections.abc import Sequence
 
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import Landmark, RunOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.pose.agreement import agreeing, order_of
+from gcar_deploy.pose.agreement import agreeing, order_of, with_motion
 from gcar_deploy.pose.bundling import TreeOf, bundled, posed
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.pose.significance import asked
-from gcar_deploy.quality import check_asked, check_consistency, check_poses, with_hint
+from gcar_deploy.quality import check_asked, check_consistency, check_motion, check_poses, with_hint
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,8 +22,8 @@ class Registered:
 
     Attributes
     ----------
-    views : V vessel images with their corrections built in; of raw pictures at times only what
-        agrees of each
+    views : V vessel images with their corrections built in, the motion of the heart undone; of
+        raw pictures at times only what agrees of each
     poses : the corrections, one per view, the first of them zero
     findings : reasons for ``degraded``
     hint : what a refusal should say as well; mostly empty
@@ -40,6 +40,28 @@ class Registered:
     def disagreement(self) -> float:
         """Worst disagreement of a view with its partner after the corrections, 0 .. 1."""
         return max(pose.after for pose in self.poses)
+
+    def pictures(self, angiograms: Sequence[Angiogram]) -> list[Angiogram]:
+        """Return the pictures as the views show them: with the motion of the heart undone."""
+        return [pose.still(a) for a, pose in zip(angiograms, self.poses, strict=True)]
+
+    def marks(self, options: RunOptions) -> RunOptions:
+        """Return the options with what a person marked where the views show it now."""
+
+        def moved(marks: Sequence[Landmark]) -> tuple[Landmark, ...]:
+            return tuple(
+                tuple(
+                    point and pose.still_at(view.carm, point)
+                    for point, pose, view in zip(mark, self.poses, self.views, strict=True)
+                )
+                for mark in marks
+            )
+
+        if all(pose.motion is None for pose in self.poses):
+            return options
+        return dataclasses.replace(
+            options, same_branch=moved(options.same_branch), ostia=moved(options.ostia)
+        )
 
     def or_refuse(self) -> None:
         """Raise RefusedError where the views contradict each other."""
@@ -73,10 +95,14 @@ def register(
         Also of views that contradict each other: ``or_refuse`` raises then.
     """
     views, poses, findings = agreeing(angiograms, views, options)
-    poses = bundled(views, poses, tree_of, options)
-    order, hint = order_of(views, poses, options)
+    rigid = bundled(views, poses, tree_of, options)
+    order, hint = order_of(views, rigid, options)
     findings += order
-    for one in asked(views, poses, options):
+    poses = with_motion(views, rigid, options)
+    findings += check_motion(
+        views, [(p.motion_mm, q.after) for p, q in zip(poses, rigid, strict=True)], options.quality
+    )
+    for one in asked(views, rigid, options):
         ids = views[one.partner].view_id, views[one.view].view_id
         turn = one.turn_deg, one.turned, one.turn_gain
         scale = one.scale, one.scaled, one.scale_gain

@@ -210,6 +210,26 @@ def check_poses(
     return findings
 
 
+def check_motion(
+    views: Sequence[VesselImage], motions: Sequence[tuple[float, float]], options: QualityOptions
+) -> list[str]:
+    """Judge the motion of the heart between the runs, beyond a shift.
+
+    Parameters
+    ----------
+    views : V vessel images
+    motions : (V,) root mean square across the epipolar planes in mm (0: none was found), and the
+        disagreement with a rigid correction alone, 0 .. 1
+    """
+    return [
+        f"view {view.view_id}: beyond a shift the heart moved by {moved:.1f} mm (root mean square) "
+        "across the planes of the beams; that is undone, but as much within the planes leaves no "
+        "trace and bends the tree"
+        for view, (moved, rigid) in zip(views, motions, strict=True)
+        if moved > options.good_motion_mm or (moved and rigid > options.good_disagreement)
+    ]
+
+
 def _is_cut(mask: Mask) -> bool:
     """Whether vessels reach the border of their picture."""
     return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
