@@ -98,7 +98,8 @@ def register(
     rigid = bundled(views, poses, tree_of, options)
     order, hint = order_of(views, rigid, options)
     findings += order
-    poses = with_motion(views, rigid, options)
+    # Pictures that agree far better the other way round are swapped: no heart has moved.
+    poses = rigid if hint else with_motion(views, rigid, options)
     findings += check_motion(
         views, [(p.motion_mm, q.after) for p, q in zip(poses, rigid, strict=True)], options.quality
     )
