@@ -14,7 +14,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.centerline import build_tree
-from gcar_deploy.tree.tree import Tree, polyline_arc
+from gcar_deploy.tree.tree import Tree, along, polyline_arc
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.scenes.render import path_lengths
@@ -28,6 +28,9 @@ LENGTH_MM = (8.0, 16.0)
 MIN_VESSEL_MM, MIN_RADIUS_MM, END_SHARE, CLEAR_MM = 25.0, 1.0, 0.3, 4.0
 #: the healthy radius round a narrowing is made a straight line so far beyond it, mm
 HEALTHY_MM = 8.0
+#: vessels with a lesion are drawn in pieces so short, mm: a piece has one radius and round ends,
+#: and long ones would fill a narrow core that the truth has
+PIECE_MM = 0.25
 #: label volumes are turned into vessels on voxels of this edge, mm, radii smoothed over so much
 LABEL_VOXEL_MM, RADIUS_SMOOTH_MM = 0.7, 3.0
 
@@ -121,7 +124,8 @@ def with_stenosis(
     if not places:
         return None
     k, middle = places[int(rng.integers(len(places)))]
-    vessel, drawn, length = vessels[k], rng.uniform(*PERCENT), rng.uniform(*LENGTH_MM)
+    changed = [_finer(vessel) for vessel in vessels]
+    vessel, drawn, length = changed[k], rng.uniform(*PERCENT), rng.uniform(*LENGTH_MM)
     percent = drawn if percent is None else percent
     arc = vessel.arc_mm
     near = np.abs(arc - middle) <= length / 2 + HEALTHY_MM
@@ -131,9 +135,15 @@ def with_stenosis(
     narrowed = healthy * (1 - percent / 100 * 0.5 * (1 + np.cos(np.pi * off)))
     radius = np.where(near, narrowed, vessel.radius_mm)
     least = 2 * float(healthy[np.argmin(np.abs(arc - middle))]) * (1 - percent / 100)
-    changed = list(vessels)
     changed[k] = dataclasses.replace(vessel, radius_mm=np.maximum(radius, 0.2))
     return StenosisCase(name, tuple(changed), Lesion(k, middle, length, percent, least))
+
+
+def _finer(vessel: Tube) -> Tube:
+    """Return the same vessel in steps of ``PIECE_MM``."""
+    arc = vessel.arc_mm
+    at = np.linspace(0.0, arc[-1], max(2, int(np.ceil(arc[-1] / PIECE_MM)) + 1))
+    return Tube(vessel.name, along(vessel.points_mm, arc, at), np.interp(at, arc, vessel.radius_mm))
 
 
 def _clear(vessels: tuple[Tube, ...], k: int) -> np.ndarray:

@@ -10,11 +10,13 @@ import pytest
 pytest.importorskip("numba")
 from gcar_deploy.engine import Engine
 from gcar_deploy.tree.tree import Tree
+from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
     Tube,
     generated_tubes,
     label_tubes,
+    pictures,
     with_stenosis,
 )
 from gcar_export.studies.lumen_table import compare, measure_case, point_graph, table
@@ -44,6 +46,21 @@ def test_a_stenosis_is_as_severe_as_it_says(case):
     assert 2 * vessel.radius_mm.min() == pytest.approx(lesion.minimal_diameter_mm, abs=0.02)
     outside = np.abs(vessel.arc_mm - lesion.middle_mm) > lesion.length_mm / 2
     np.testing.assert_allclose(vessel.radius_mm[outside], 1.5)
+
+
+def test_the_narrow_core_is_drawn_as_narrow_as_it_says():
+    """Points 1 mm apart, as the generator has them: pieces so long would fill the core."""
+    (first, second), _, _ = clinical_geometry(2)
+    across_both = np.cross(first.source_mm, second.source_mm)
+    across_both /= np.linalg.norm(across_both)
+    s = np.arange(-40, 40.1, 1.0)
+    straight = Tube("a", s[:, None] * across_both, np.full(len(s), 2.0))
+    made = with_stenosis("straight", (straight,), np.random.default_rng(0), 60.0)
+    middle = (made.lesion.middle_mm - 40) * across_both
+    for picture in pictures(made)[0]:
+        column, row = np.rint(picture.carm.project(middle[None])[0][0]).astype(int)
+        path = picture.pixels * picture.intensity.mm_per_count
+        assert path[row, column] == pytest.approx(1.6, abs=0.08)
 
 
 def test_the_truth_has_no_error(case):
