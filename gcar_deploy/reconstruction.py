@@ -25,7 +25,7 @@ from gcar_deploy.geometry.observability import (
     silent_errors,
 )
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.measure import BranchName, Measured, Sections, measured
+from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
 from gcar_deploy.pose import Pose
@@ -116,14 +116,19 @@ class Reconstruction:
         return measured(self.tree, self.views, self.sections, self.options.lesions)
 
     @functools.cached_property
+    def lumen(self) -> tuple[Tree, tuple[Sections, ...]]:
+        """The tree with a point at each section, as ``diameters.csv`` has it; its sections."""
+        return lumen_tree(self.tree, self.sections)
+
+    @functools.cached_property
     def pressure(self) -> PressureDrop:
         """Pd/Pa along each branch at the usual assumed flow."""
         found = () if self.quality.ghosts is None else self.quality.ghosts.probable
         ghosts = {ghost.branch: ghost.probability for ghost in found}
         doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches), ghosts)
         names = [None if name is None else name.name for name in self.names]
-        # From the radii alone, as ``gcar flow`` has them from the folder.
-        return pressure_drop(self.tree, tree_lumens(self.tree), doubts=doubts, names=names)
+        tree, sections = self.lumen
+        return pressure_drop(tree, tree_lumens(tree, sections), doubts=doubts, names=names)
 
     @functools.cached_property
     def unexplained(self) -> tuple[Mask, ...]:

@@ -106,7 +106,7 @@ def sigma_table(
 @click.command("flow-table")
 @click.option("--count", default=20, show_default=True, help="Generated trees.")
 @click.option("--percent", default=60.0, show_default=True, help="Diameter stenosis of each.")
-@click.option("--fit", is_flag=True, help="Print constants fitted to other trees instead.")
+@click.option("--fit", is_flag=True, help="Other trees, of 30 .. 75 %, and constants.")
 def flow_table(count: int, percent: float, fit: bool) -> None:
     """Compare the pressure drop behind a stenosis with that of the true lumen.
 
@@ -117,6 +117,6 @@ def flow_table(count: int, percent: float, fit: bool) -> None:
     with click.progressbar(length=count, label="trees", file=sys.stderr) as bar:
         rows, errors = flow.flow_rows(count, percent, fit, lambda: bar.update(1))
     if fit:
-        floor, share, lost = flow.fitted(errors)
-        click.echo(f"FLOOR_MM {floor:.3f}, SHARE {share:.3f}, LOST {lost:.3f}")
+        floor, factor, lost = flow.fitted(errors)
+        click.echo(f"FLOOR_MM {floor:.3f}, FACTOR {factor:.3f}, LOST {lost:.3f}")
     click.echo(flow.table(rows))

@@ -12,7 +12,9 @@ from scipy.spatial import cKDTree
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.flow import Assumption, PressureDrop, model_0d, pressure_drop
-from gcar_deploy.measure.lumen import tree_lumens
+from gcar_deploy.measure import Sections
+from gcar_deploy.measure.lumen import LESION_SHARE, tree_lumens
+from gcar_deploy.result import Result
 from gcar_deploy.tree.tree import Tree
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
@@ -24,6 +26,8 @@ from gcar_export.scenes.true_trees import joined_tree
 
 #: seeds of the trees: judged ones and those that constants are fitted to, both away from training
 JUDGED, FITTED = 9_100_000, 9_200_000
+#: percent diameter stenosis that constants are fitted to, drawn evenly, and the seed of the draw
+FIT_PERCENT, FIT_SEED = (30.0, 75.0), 777
 #: Pd/Pa is compared so far behind a lesion, mm; a point of the truth counts so near, mm
 BEHIND_MM, NEAR_MM = 5.0, 2.0
 #: diameters are compared only so far from other vessels, mm
@@ -56,10 +60,11 @@ class FlowRow:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DiameterError:
-    """(n,) true and found diameters and healthy ones, mm, of clear points of one tree."""
+    """(n,) true and found diameters, stated sigma and healthy diameters, mm, of clear points."""
 
     true_mm: np.ndarray
     found_mm: np.ndarray
+    stated_mm: np.ndarray
     healthy_mm: np.ndarray
 
 
@@ -76,26 +81,34 @@ def flow_rows(
 
     Parameters
     ----------
-    fit : the trees that constants are fitted to, not those that they are judged on
+    percent : stenosis of each judged tree
+    fit : the trees that constants are fitted to, of all severities, not those that they are
+        judged on
     """
     engine, rows, errors = Engine(threads=1), [], []
     for k in range(count):
         seed = (FITTED if fit else JUDGED) + k
-        case = flow_case(seed, percent)
+        severity = np.random.default_rng(FIT_SEED + k).uniform(*FIT_PERCENT) if fit else percent
+        case = flow_case(seed, float(severity))
         if case is not None:
             try:
                 result = engine.reconstruct(*pictures(case))
             except GcarError:
                 rows.append(FlowRow(name=case.name, status="refused", true_drop_mmhg=np.nan))
             else:
-                rows.append(compare(case, result.tree, result.status, seed))
-                errors.append(diameters(case, result.tree))
+                rows.append(compare(case, *told_of(result), seed))
+                errors.append(diameters(case, *result.lumen))
         if on_case is not None:
             on_case()
     return rows, errors
 
 
-def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
+def told_of(result: Result) -> tuple[Tree, PressureDrop, str]:
+    """Return what the product tells: lumen, pressure drop, status."""
+    return result.lumen[0], result.pressure, result.status
+
+
+def compare(case: StenosisCase, tree: Tree, drop: PressureDrop, status: str, seed: int) -> FlowRow:
     """Pd/Pa of a tree behind the true lesion, against that of the truth."""
     place, middle = _behind(case), _middle(case)
     truth = joined_tree(case.vessels)
@@ -105,7 +118,7 @@ def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
         name=case.name, status=status,
         true_drop_mmhg=np.nan if true is None else (1 - true[0]) * usual.aortic_pressure_mmhg,
     )  # fmt: skip
-    found = _at(tree, told(tree, usual), place, middle)
+    found = _at(tree, drop, place, middle)
     if true is None or found is None:
         return row
     rng = np.random.default_rng(seed)
@@ -121,16 +134,16 @@ def compare(case: StenosisCase, tree: Tree, status: str, seed: int) -> FlowRow:
         covered=found[1] <= true[0] <= found[2],
         covered_flow=other is not None and found[1] <= other[0] <= found[2],
         width=found[2] - found[1],
-        withheld=found[3] or ("degraded" if status == "degraded" else ""),
+        withheld=found[3],
     )
 
 
 def told(tree: Tree, assumed: Assumption) -> PressureDrop:
-    """Pressure drop of a tree."""
+    """Pressure drop of the truth."""
     return pressure_drop(tree, tree_lumens(tree), assumed)
 
 
-def diameters(case: StenosisCase, tree: Tree) -> DiameterError:
+def diameters(case: StenosisCase, tree: Tree, sections: Sequence[Sections]) -> DiameterError:
     """Compare diameters where one vessel alone is near."""
     own = np.concatenate([np.full(len(v.points_mm), k) for k, v in enumerate(case.vessels)])
     points = np.concatenate([v.points_mm for v in case.vessels])
@@ -141,30 +154,37 @@ def diameters(case: StenosisCase, tree: Tree) -> DiameterError:
         g <= 0.5 * NEAR_MM and len(set(own[near])) == 1
         for g, near in zip(gap, lookup.query_ball_point(tree.points(), CLEAR_MM), strict=True)
     ])  # fmt: skip
-    healthy = np.concatenate([lumen.healthy_mm for lumen in tree_lumens(tree)])
+    healthy = np.concatenate([lumen.healthy_mm for lumen in tree_lumens(tree, sections)])
+    stated = np.concatenate([own.sigma_mm for own in sections])
     return DiameterError(
-        true_mm=2 * radii[at][clear], found_mm=2 * tree.radii()[clear], healthy_mm=healthy[clear]
-    )
+        true_mm=2 * radii[at][clear], found_mm=2 * tree.radii()[clear],
+        stated_mm=stated[clear], healthy_mm=healthy[clear],
+    )  # fmt: skip
 
 
 def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float]:
-    """Constants of ``flow.spread`` that make the errors likeliest: floor, share, lost."""
-    true, found, healthy = (
+    """Constants of ``flow.spread``: floor, factor, lost.
+
+    Lost is the median over narrow places, which trees that are wrong there do not move; floor and
+    factor make what is left likeliest.
+    """
+    true, found, stated, healthy = (
         np.concatenate([getattr(e, name) for e in errors])
-        for name in ("true_mm", "found_mm", "healthy_mm")
+        for name in ("true_mm", "found_mm", "stated_mm", "healthy_mm")
     )
     narrow = np.maximum(np.nan_to_num(healthy - found), 0.0)
+    core = narrow > LESION_SHARE * found
+    lost = max(float(np.median((found - true)[core] / narrow[core])), 0.0) if core.any() else 0.0
+    left = found - lost * narrow - true
 
     def cost(log: np.ndarray) -> float:
-        floor, share, lost = np.exp(log)
-        variance = floor**2 + (share * found) ** 2
-        return float(
-            np.mean(0.5 * np.log(variance) + 0.5 * (found - lost * narrow - true) ** 2 / variance)
-        )
+        floor, factor = np.exp(log)
+        variance = floor**2 + (factor * stated) ** 2
+        return float(np.mean(0.5 * np.log(variance) + 0.5 * left**2 / variance))
 
-    best = minimize(cost, np.log([0.1, 0.05, 0.05]), method="Nelder-Mead")
-    floor, share, lost = np.exp(best.x).tolist()
-    return floor, share, lost
+    best = minimize(cost, np.log([0.05, 1.0]), method="Nelder-Mead")
+    floor, factor = np.exp(best.x).tolist()
+    return floor, factor, lost
 
 
 def solver_gap(tree: Tree, drop: PressureDrop) -> float:

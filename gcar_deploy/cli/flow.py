@@ -70,6 +70,7 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
       gcar flow result --out model
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.flow import doubts_of, pressure_drop, pressure_table
+    from gcar_deploy.measure import lumen_tree
     from gcar_deploy.measure.lumen import tree_lumens
     from gcar_deploy.output.folder import check_target
     from gcar_deploy.output.stored import read_folder
@@ -77,12 +78,13 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
     if out is not None:
         check_target(out, force=force, inputs=(result,))
     stored = read_folder(result)
-    tree, told = stored.tree, stored.summary
+    told = stored.summary
+    tree, sections = stored.lumen or lumen_tree(stored.tree, None)
     found = told.get("ambiguity", {}).get("probable_ghosts", ())
     ghosts = {ghost["branch"] - 1: ghost["probability"] for ghost in found}
     doubts = doubts_of(told["status"], told["sentence"], len(tree.branches), ghosts)
     names = [branch.get("name") for branch in told["tree"]["branches"]]
-    drop = pressure_drop(tree, tree_lumens(tree), assumed, doubts, names)
+    drop = pressure_drop(tree, tree_lumens(tree, sections), assumed, doubts, names)
     table = pressure_table(drop)
     if out is not None:
         from gcar_deploy.output.handover import write_handover

@@ -18,13 +18,15 @@ from gcar_deploy.flow.assumption import (
     Assumption,
 )
 from gcar_deploy.flow.hydraulics import expansion_loss, expansions, piece_resistance
-from gcar_deploy.flow.network import Network, flows, network_of
+from gcar_deploy.flow.network import Network, flows, network_of, own_flows
 from gcar_deploy.flow.spread import Draws, draw
 from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
 Interval = tuple[float, float]
+#: flow by the split over its flow by the own calibre, or the reverse, with which a value is given
+MOST_UNLIKE = 3.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +42,8 @@ class VesselPressure:
     flow_m3_s : through it
     drop_pa : from its inlet to its far end
     withheld : why no value is given; empty where one is
+    doubtful : nothing is told of any point, whatever the interval: tree, flow or result are in
+        doubt
     """
 
     arc_mm: Scalars
@@ -51,6 +55,7 @@ class VesselPressure:
     flow_m3_s: float
     drop_pa: float
     withheld: str
+    doubtful: bool
 
     @property
     def flow_ml_min(self) -> float:
@@ -71,12 +76,7 @@ class VesselPressure:
     def told(self) -> Array:
         """(m,) bool: points at which the interval is narrow enough for a value to be shown."""
         narrow = self.high - self.low <= MOST_WIDTH
-        return narrow if not self.withheld or self.too_wide else np.zeros_like(narrow)
-
-    @property
-    def too_wide(self) -> bool:
-        """Whether the width of the interval is what speaks against a value."""
-        return bool(self.high[-1] - self.low[-1] > MOST_WIDTH)
+        return np.zeros_like(narrow) if self.doubtful else narrow
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +105,7 @@ def pressure_drop(
     Parameters
     ----------
     tree : Tree, mm, branches from their inlets (``measure.inlet``)
-    lumens : its branches' lumens, for the healthy diameter and how narrow the vessel is
+    lumens : its branches' lumens, with a section at each point (``measure.lumen_tree``)
     assumed : Assumption; None takes the usual one
     doubts : branch -> why nothing may be said of it and of what lies behind it
     names : of its branches, which tell a second artery from a piece that was torn off
@@ -217,7 +217,8 @@ def _vessels(
     }
     flow = model.flows(model.still, np.ones(1), np.ones((1, len(tree.branches))))[0]
     nominal = cases["nominal"][0]
-    inherited = dict(doubts)
+    own_flow = own_flows(network, network.calibre_mm, flow, assumed)
+    inherited = {**_unlike(flow, own_flow), **doubts}
     for k in network.order:
         above = network.parent[k]
         if above is not None and above in inherited and k not in inherited:
@@ -226,6 +227,7 @@ def _vessels(
     for k, branch in enumerate(tree.branches):
         own = slice(model.first[k], model.last[k] + 1)
         ratio = nominal[own]
+        doubt = network.left_out.get(k) or inherited.get(k, "")
         out.append(
             VesselPressure(
                 arc_mm=network.from_mm[k] + branch.arc_mm,
@@ -234,11 +236,22 @@ def _vessels(
                 from_flow=(float(ends["flow"][0, k]), float(ends["flow"][1, k])),
                 flow_m3_s=float(flow[k]),
                 drop_pa=float((ratio[0] - ratio[-1]) * assumed.aortic_pressure_pa),
-                withheld=network.left_out.get(k) or inherited.get(k)
+                withheld=doubt
                 or _too_much(float(ratio[-1]), float(low[own][-1]), float(high[own][-1]), assumed),
+                doubtful=bool(doubt),
             )
         )  # fmt: skip
     return tuple(out)
+
+
+def _unlike(split: Array, own: Array) -> dict[int, str]:
+    """Branches whose flow hangs on what else was found, and why nothing is told of them."""
+    return {
+        k: f"the flow hangs on the branches found beside it: {a / M3_S_PER_ML_MIN:.0f} ml/min by "
+        f"the split, {b / M3_S_PER_ML_MIN:.0f} by its own calibre"
+        for k, (a, b) in enumerate(zip(split, own, strict=True))
+        if max(a, b) > MOST_UNLIKE * min(a, b) > 0
+    }
 
 
 def _too_much(ratio: float, low: float, high: float, assumed: Assumption) -> str:

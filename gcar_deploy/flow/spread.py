@@ -1,9 +1,10 @@
 """How far diameters may be off, and trees drawn with such errors.
 
-The standard deviation of a diameter grows with the diameter, and on average a narrow core comes
-out too wide, since it is smoothed over:
+Every section states its own standard deviation s (``measure.sections``): small where two views show
+the lumen alone, large where other vessels lie over it. On average a narrow core comes out too wide,
+since it is smoothed over:
 
-    sigma^2 = FLOOR^2 + (SHARE d)^2,  mean = d - LOST n,  n = healthy - d.
+    sigma^2 = FLOOR^2 + (FACTOR s)^2,  mean = d - LOST n,  n = healthy - d.
 
 Errors along a vessel go together. A part is common to a branch (calibration, threshold), the rest
 changes over ``REACH_MM``. The first three are what ``gcar-export flow-table --fit`` finds most
@@ -22,16 +23,20 @@ from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
-FLOOR_MM, SHARE, LOST = 0.136, 0.047, 0.081
+FLOOR_MM, FACTOR, LOST = 0.028, 1.067, 0.035
+#: share of the diameter and mm, where no section states its own: a guess, and on the wide side
+UNSTATED_SHARE, UNSTATED_MM = 0.05, 0.14
 #: share of the variance that is common to a branch, and how far the rest reaches along it, mm
 COMMON, REACH_MM = 0.3, 4.0
 #: a diameter is known to a factor of this at worst; a wider spread says nothing more
 _MOST_LOG = 0.5
 
 
-def diameter_sigma_mm(branch: Branch) -> Scalars:
+def diameter_sigma_mm(branch: Branch, lumen: BranchLumen) -> Scalars:
     """(m,) standard deviation of the diameter at each point of a branch, mm."""
-    out: Scalars = np.sqrt(FLOOR_MM**2 + (SHARE * 2.0 * branch.radius_mm) ** 2)
+    stated = lumen.sections.sigma_mm
+    unstated = np.hypot(UNSTATED_MM, UNSTATED_SHARE * 2.0 * branch.radius_mm)
+    out: Scalars = np.where(np.isfinite(stated), np.hypot(FLOOR_MM, FACTOR * stated), unstated)
     return out
 
 
@@ -63,11 +68,11 @@ def draw(
     Parameters
     ----------
     tree : Tree with a branch
-    lumens : of its branches
+    lumens : of its branches, with a section at each point
     samples : how many
     """
     pairs = list(zip(tree.branches, lumens, strict=True))
-    sigma_mm = np.concatenate([diameter_sigma_mm(branch) for branch in tree.branches])
+    sigma_mm = np.concatenate([diameter_sigma_mm(*pair) for pair in pairs])
     lost = LOST * np.concatenate([narrowing_mm(*pair) for pair in pairs])
     owner = tree.branch_index()
     n = len(tree.branches)

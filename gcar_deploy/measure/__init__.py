@@ -2,6 +2,7 @@
 
 from gcar_deploy.measure.bridges import joined_over_lesions
 from gcar_deploy.measure.inlet import from_inlets
+from gcar_deploy.measure.lumen_tree import lumen_tree
 from gcar_deploy.measure.measured import Measured, measured
 from gcar_deploy.measure.naming import BranchName
 from gcar_deploy.measure.sections import Sections, measure_sections, with_diameters
@@ -13,6 +14,7 @@ __all__ = [
     "Sections",
     "from_inlets",
     "joined_over_lesions",
+    "lumen_tree",
     "measure_sections",
     "measured",
     "read_signal",

@@ -16,6 +16,7 @@ from gcar_deploy.output.report import report_html
 from gcar_deploy.output.tables import (
     centerline_csv,
     centerline_vtp,
+    diameters_csv,
     gaussians_npz,
     gaussians_ply,
 )
@@ -52,6 +53,7 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         "gaussians.ply": lambda: gaussians_ply(result.gaussians),
         "centerline.vtp": lambda: centerline_vtp(result.tree, result.measured, ghosts),
         "centerline.csv": lambda: centerline_csv(result.tree, result.measured, ghosts),
+        "diameters.csv": lambda: diameters_csv(result.lumen, result.measured),
         "surface.stl": lambda: stl_bytes(surface),
     }
     if "glb" in extras:

@@ -7,25 +7,39 @@ import dataclasses
 import hashlib
 import io
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import read_bounded
+from gcar_deploy.measure import Sections
+from gcar_deploy.output.tables import SECTION_COLUMNS
 from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.types import Array
 
 _MOST_BYTES = 2**26
+_Parsed = TypeVar("_Parsed")
 _COLUMNS = ("branch", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Stored:
-    """What a result folder holds: ``result.json``, and the tree of ``centerline.csv``."""
+    """What a result folder holds.
+
+    Attributes
+    ----------
+    summary : ``result.json``
+    tree : of ``centerline.csv``
+    lumen : tree with a point at each section, and its sections, of ``diameters.csv``; None where
+        there is no such file
+    """
 
     summary: dict[str, Any]
     tree: Tree
+    lumen: tuple[Tree, tuple[Sections, ...]] | None
 
 
 def read_folder(folder: Path) -> Stored:
@@ -34,21 +48,35 @@ def read_folder(folder: Path) -> Stored:
     Raises
     ------
     UsageError
-        It is none, or ``centerline.csv`` is not as it was written.
+        It is none, or a table is not as it was written.
     """
     summary = read_summary(folder)
+    tree = _parsed(folder, "centerline.csv", summary, _tree)
+    lumen = None
+    # Folders of versions before have none.
+    if "diameters.csv" in summary.get("files", {}):
+        lumen = _parsed(folder, "diameters.csv", summary, _lumen)
+    return Stored(summary=summary, tree=tree, lumen=lumen)
+
+
+def _parsed(
+    folder: Path,
+    name: str,
+    summary: dict[str, Any],
+    parse: Callable[[str, list[dict[str, Any]]], _Parsed],
+) -> _Parsed:
+    """Table of a folder, if it is as it was written and fits ``result.json``."""
     try:
-        data = read_bounded(folder / "centerline.csv", _MOST_BYTES)
+        data = read_bounded(folder / name, _MOST_BYTES)
     except ValueError as error:
-        raise UsageError(f"{folder / 'centerline.csv'} {error}") from None
-    listed = summary.get("files", {}).get("centerline.csv", {})
+        raise UsageError(f"{folder / name} {error}") from None
+    listed = summary.get("files", {}).get(name, {})
     if hashlib.sha256(data).hexdigest() != listed.get("sha256"):
-        raise UsageError(f"{folder / 'centerline.csv'} is not as it was written; run gcar again")
+        raise UsageError(f"{folder / name} is not as it was written; run gcar again")
     try:
-        tree = _tree(data.decode("ascii"), summary["tree"]["branches"])
+        return parse(data.decode("ascii"), summary["tree"]["branches"])
     except (KeyError, ValueError, TypeError, IndexError):
-        raise UsageError(f"{folder}: centerline.csv and result.json do not fit together") from None
-    return Stored(summary=summary, tree=tree)
+        raise UsageError(f"{folder}: {name} and result.json do not fit together") from None
 
 
 def read_summary(path: Path) -> dict[str, Any]:
@@ -73,9 +101,7 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 def _tree(text: str, told: list[dict[str, Any]]) -> Tree:
     """Tree of the rows of centerline.csv, with the nodes of result.json."""
-    rows = [[float(row[name] or "nan") for name in _COLUMNS]
-            for row in csv.DictReader(io.StringIO(text))]  # fmt: skip
-    table = np.array(rows).reshape(-1, len(_COLUMNS))
+    table = _table(text, _COLUMNS)
     branches = []
     nodes = np.zeros((1 + max((max(b["start"], b["end"]) for b in told), default=-1), 3))
     for number, branch in enumerate(told, start=1):
@@ -93,3 +119,42 @@ def _tree(text: str, told: list[dict[str, Any]]) -> Tree:
     if sum(len(branch) for branch in branches) != len(table):
         raise ValueError("more branches than told")
     return Tree(nodes_mm=nodes, branches=tuple(branches))
+
+
+def _lumen(text: str, told: list[dict[str, Any]]) -> tuple[Tree, tuple[Sections, ...]]:
+    """Lumen of the rows of diameters.csv, with the nodes of result.json."""
+    table = _table(text, ("branch", *SECTION_COLUMNS))
+    nodes = np.zeros((1 + max((max(b["start"], b["end"]) for b in told), default=-1), 3))
+    branches, sections = [], []
+    for number, branch in enumerate(told, start=1):
+        own = table[table[:, 0] == number]
+        if len(own) < 2 or not np.isfinite(own[:, 1:6]).all() or (own[:, 5] <= 0).any():
+            raise ValueError(f"branch {number}")
+        start, end = int(branch["start"]), int(branch["end"])
+        nodes[start], nodes[end] = own[0, 2:5], own[-1, 2:5]
+        branches.append(
+            Branch(
+                points_mm=own[:, 2:5], radius_mm=0.5 * own[:, 5],
+                sigma_mm=np.full(len(own), np.nan), confidence=np.ones(len(own)),
+                start=start, end=end,
+            )
+        )  # fmt: skip
+        blank = np.zeros((0, len(own)))
+        sections.append(
+            Sections(
+                arc_mm=branches[-1].arc_mm, diameter_mm=own[:, 5], sigma_mm=own[:, 6],
+                measured=own[:, 8] > 0, width_mm=blank, foreshortened=blank.astype(bool),
+                overlapped=blank.astype(bool),
+            )
+        )  # fmt: skip
+    if sum(len(branch) for branch in branches) != len(table):
+        raise ValueError("more branches than told")
+    return Tree(nodes_mm=nodes, branches=tuple(branches)), tuple(sections)
+
+
+def _table(text: str, columns: Sequence[str]) -> Array:
+    """(rows, columns) of a CSV; empty fields are NaN."""
+    rows = [
+        [float(row[name] or "nan") for name in columns] for row in csv.DictReader(io.StringIO(text))
+    ]
+    return np.array(rows).reshape(-1, len(columns))

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.measure import Measured
+from gcar_deploy.measure import Measured, Sections
 from gcar_deploy.output.vtp import poly_data
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
@@ -22,6 +22,10 @@ _OPACITY_RANGE = (0.01, 0.99)
 
 #: entries of a covariance, in the order of a symmetric tensor in VTK
 _ENTRIES = ("xx", "yy", "zz", "xy", "yz", "xz")
+#: columns of diameters.csv behind the branch's number
+SECTION_COLUMNS = (
+    "arc_mm", "x_mm", "y_mm", "z_mm", "diameter_mm", "sigma_mm", "reference_mm", "measured",
+)  # fmt: skip
 _ROWS, _COLUMNS = [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]
 
 
@@ -140,6 +144,26 @@ def centerline_csv(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
             for point, row in enumerate(numbers.tolist())
         ]
     return ("\n".join(rows) + "\n").encode("ascii")
+
+
+def diameters_csv(lumen: tuple[Tree, tuple[Sections, ...]], measured: Measured) -> bytes:
+    """One row per section: place, diameter with its standard deviation, reference.
+
+    Branches are numbered from 1; ``measured`` is 0 where no view shows the lumen, and the diameter
+    is what lies between those that are. Unknown values are empty fields.
+    """
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["branch", *SECTION_COLUMNS])
+    tree, sections = lumen
+    told = zip(tree.branches, sections, measured.lumens, strict=True)
+    for number, (branch, own, figures) in enumerate(told, 1):
+        columns = [
+            own.arc_mm, branch.points_mm, own.diameter_mm, own.sigma_mm, figures.reference_mm,
+        ]  # fmt: skip
+        for row, seen in zip(np.column_stack(columns), own.measured, strict=True):
+            writer.writerow([number, *(_field(value) for value in row), int(seen)])
+    return stream.getvalue().encode("ascii")
 
 
 def _told(measured: Measured) -> list[tuple[str, float]]:

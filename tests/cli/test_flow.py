@@ -54,13 +54,23 @@ def test_values_out_of_range(copy, option, value, says):
     assert done.code == 2 and says in done.err and done.err.count("\n") == 1
 
 
+def test_a_folder_of_a_version_before_has_radii_alone(copy):
+    told = json.loads((copy / "result.json").read_text())
+    del told["files"]["diameters.csv"]
+    (copy / "result.json").write_text(json.dumps(told))
+    (copy / "diameters.csv").unlink()
+    found = json.loads(gcar("flow", copy, "--json").out)
+    assert len(found["branches"]) == len(told["tree"]["branches"])
+
+
 def test_a_folder_that_is_no_result(tmp_path):
     done = gcar("flow", tmp_path)
     assert done.code == 2 and "result.json" in done.err
 
 
-def test_an_altered_centreline_is_refused(copy):
-    file = copy / "centerline.csv"
+@pytest.mark.parametrize("table", ["centerline.csv", "diameters.csv"])
+def test_an_altered_table_is_refused(copy, table):
+    file = copy / table
     file.write_text(file.read_text().replace("1.", "2."))
     done = gcar("flow", copy)
     assert done.code == 2 and "not as it was written" in done.err

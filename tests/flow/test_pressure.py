@@ -10,6 +10,8 @@ import pytest
 from gcar_deploy.errors import UsageError
 from gcar_deploy.flow import Assumption, doubts_of, pressure_drop, pressure_table
 from gcar_deploy.flow.assumption import M3_S_PER_ML_MIN
+from gcar_deploy.flow.network import flows, network_of, own_flows
+from gcar_deploy.flow.pressure import _unlike
 from gcar_deploy.flow.spread import diameter_sigma_mm, draw
 from gcar_deploy.measure import from_inlets
 from gcar_deploy.measure.lumen import tree_lumens
@@ -84,6 +86,10 @@ def test_a_degraded_result_tells_nothing():
     lumens = tree_lumens(tree)
     for vessel in pressure_drop(tree, lumens, doubts=doubts_of("degraded", "Why.", 3)).vessels:
         assert vessel.withheld == "the result is degraded: Why." and not vessel.told.any()
+    # Nor at points where the interval of a wide one is still narrow.
+    narrow = stenosed(65.0)
+    doubted = pressure_drop(narrow, tree_lumens(narrow), doubts={0: "why"}).vessels[0]
+    assert drop_of(narrow).vessels[0].told.any() and not doubted.told.any()
     assert doubts_of("ok", "Fine.", 3) == {}
     assert doubts_of("ok", "Fine.", 3, {1: 0.9}) == {1: "it is a ghost with probability 0.90"}
 
@@ -135,7 +141,7 @@ def test_draws_have_the_stated_sigma():
     tree = stenosed(50.0, count=61)
     own = tree.branches[0]
     (lumen,) = tree_lumens(tree)
-    sigma = diameter_sigma_mm(own)
+    sigma = diameter_sigma_mm(own, lumen)
     drawn = draw(tree, [lumen], 4000, np.random.default_rng(0)).points
     np.testing.assert_allclose(drawn.std(axis=0), sigma / (2 * tree.radii()), rtol=0.08)
     # Narrow cores come out too wide: what may be there is narrower.
@@ -157,6 +163,22 @@ def test_intervals_hold_the_truth_nine_times_in_ten():
         covered += bool(found.low[-1] <= truth <= found.high[-1])
     # 90 expected; three standard deviations of a binomial either way.
     assert 81 <= covered <= 99
+
+
+def test_nothing_is_told_where_the_two_laws_of_flow_are_far_apart():
+    assert not any(vessel.withheld for vessel in drop_of(stenosed_fork(0.0)).vessels)
+    split, own = np.array([3e-6, 1e-6, 1e-6, 0.0]), np.array([3e-6, 2.5e-6, 4e-6, 0.0])
+    (number, why), *others = _unlike(split, own).items()
+    assert number == 2 and not others and "60 ml/min by the split, 240 by its own" in why
+
+
+def test_flow_by_the_own_calibre_is_the_split_where_the_split_is_right():
+    """d_parent^2.38 = sum d_child^2.38: both laws are one."""
+    network = network_of(stenosed_fork(0.0), tree_lumens(stenosed_fork(0.0)))
+    assumed = Assumption()
+    calibre = np.array([[(1.3**2.38 + 1.2**2.38) ** (1 / 2.38), 1.3, 1.2]])
+    split = flows(network, calibre, np.ones((1, 3)), assumed)
+    np.testing.assert_allclose(own_flows(network, calibre, split, assumed), split, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

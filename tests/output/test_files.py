@@ -24,7 +24,8 @@ from gcar_deploy.reconstruction import plain
 def test_the_folder_holds_what_the_contract_says(folder):
     assert {p.name for p in folder.iterdir()} == {
         "result.json", "volume.nii.gz", "gaussians.npz", "gaussians.ply", "centerline.vtp",
-        "centerline.csv", "surface.stl", "overlay_view1.png", "overlay_view2.png", "report.html",
+        "centerline.csv", "diameters.csv", "surface.stl", "overlay_view1.png", "overlay_view2.png",
+        "report.html",
     }  # fmt: skip
 
 

@@ -52,7 +52,7 @@ export function corrections(store, say) {
 const ABOUT = {
   "report.html": "report, one page for the record", "result.json": "all figures", "volume.nii.gz": "volume (NIfTI)",
   "surface.stl": "surface", "centerline.vtp": "centreline (VTK)",
-  "centerline.csv": "centreline (table)", "gaussians.npz": "Gaussians", "gaussians.ply": "Gaussians (3DGS)",
+  "centerline.csv": "centreline (table)", "diameters.csv": "diameters (table)", "gaussians.npz": "Gaussians", "gaussians.ply": "Gaussians (3DGS)",
 };
 
 export function files(store) {
