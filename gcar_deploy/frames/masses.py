@@ -3,7 +3,7 @@
 What all frames of a run hold alike is no contrast on its way through a beating heart. Each pixel is
 compared with the brightest that it is over the run, and of what is darker then only what is
 narrower than a vessel may be is kept: ribs, spine and most of a catheter go by the first step, the
-heart's own shadow by the second. That is coarser than a segmentation, and a hundred times cheaper.
+heart's own shadow by the second. That is coarser than a segmentation, and many times cheaper.
 """
 
 from __future__ import annotations
