@@ -135,14 +135,8 @@ def centerline_csv(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
             [branch.arc_mm, branch.points_mm, branch.radius_mm, branch.sigma_mm, branch.confidence]
         )
         after = np.column_stack([np.full(len(branch), share), ghost, spread])
-        # A whole row at once: a call for each of some thousand fields is what would take the time.
-        form = ",".join(["%d,%d", *["%.5f"] * before.shape[1], name, *["%.5f"] * after.shape[1]])
-        numbers = np.column_stack([before, after])
-        numbers[~np.isfinite(numbers)] = np.nan
-        rows += [
-            (form % (number, point, *row)).replace("nan", "")
-            for point, row in enumerate(numbers.tolist())
-        ]
+        fields = ["%d", *["%.5f"] * before.shape[1], name, *["%.5f"] * after.shape[1]]
+        rows += _rows(number, fields, np.column_stack([np.arange(len(branch)), before, after]))
     return ("\n".join(rows) + "\n").encode("ascii")
 
 
@@ -152,18 +146,27 @@ def diameters_csv(lumen: tuple[Tree, tuple[Sections, ...]], measured: Measured) 
     Branches are numbered from 1; ``measured`` is 0 where no view shows the lumen, and the diameter
     is what lies between those that are. Unknown values are empty fields.
     """
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["branch", *SECTION_COLUMNS])
+    rows = [",".join(["branch", *SECTION_COLUMNS])]
     tree, sections = lumen
     told = zip(tree.branches, sections, measured.lumens, strict=True)
     for number, (branch, own, figures) in enumerate(told, 1):
         columns = [
             own.arc_mm, branch.points_mm, own.diameter_mm, own.sigma_mm, figures.reference_mm,
+            own.measured,
         ]  # fmt: skip
-        for row, seen in zip(np.column_stack(columns), own.measured, strict=True):
-            writer.writerow([number, *(_field(value) for value in row), int(seen)])
-    return stream.getvalue().encode("ascii")
+        fields = ["%.5f"] * (len(SECTION_COLUMNS) - 1) + ["%d"]
+        rows += _rows(number, fields, np.column_stack(columns))
+    return ("\n".join(rows) + "\n").encode("ascii")
+
+
+def _rows(branch: int, fields: Sequence[str], numbers: Array) -> list[str]:
+    """Lines of a branch; what is not finite is an empty field.
+
+    A whole row at once: a call for each of some thousand fields is what would take the time.
+    """
+    form = ",".join([str(branch), *fields])
+    known = np.where(np.isfinite(numbers), numbers, np.nan)
+    return [(form % tuple(row)).replace("nan", "") for row in known.tolist()]
 
 
 def _told(measured: Measured) -> list[tuple[str, float]]:
