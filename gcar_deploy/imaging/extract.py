@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -10,7 +11,7 @@ import numpy as np
 
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import GeometryError, ModelError, RefusedError
-from gcar_deploy.imaging import calibrate, enhance, segment
+from gcar_deploy.imaging import calibrate, enhance, even_ground, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.border import cut_out, put_back, shown_box
@@ -101,6 +102,10 @@ def _seen(
     if options.segmenter == "net":
         segmenter = _needed(segmenter)
     grey = _grey_values(angiogram)
+    drawn = even_ground.shadow(grey[0]["linear"], grey[1])
+    if drawn is not None:
+        seen = dataclasses.replace(angiogram, mask=drawn.mask)
+        return _from_drawn(seen, drawn.mask) if drawn.flat else _from_grey(seen, grey, None)
     if segmenter is None or options.segmenter == "classic":
         return _from_grey(angiogram, grey, None)
     if options.segmenter == "net":
@@ -189,6 +194,10 @@ def _from_mask(angiogram: Angiogram) -> VesselImage:
         mask &= angiogram.mask
     if mask.mean() > _FULL:
         raise _nothing(angiogram, "nearly every pixel is full")
+    return _from_drawn(dataclasses.replace(angiogram, valid=valid), mask)
+
+
+def _from_drawn(angiogram: Angiogram, mask: Mask) -> VesselImage:
     line = skel.skeletonize(mask)
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     if line.sum() * pixel_mm < MIN_LENGTH_MM:
@@ -203,7 +212,7 @@ def _from_mask(angiogram: Angiogram) -> VesselImage:
         path_error=MASK_ERROR,
         mask=mask,
         skeleton=line,
-        valid=valid,
+        valid=np.ones(mask.shape, bool) if angiogram.valid is None else angiogram.valid,
         kind="mask",
     )
 

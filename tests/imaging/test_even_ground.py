@@ -1,0 +1,110 @@
+"""Trees drawn on an even ground are seen whole, and nothing else is taken for such a picture."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.even_ground import shadow
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.types import Image, Mask
+
+SIDE = 400
+NO_HOLES = np.zeros((SIDE, SIDE), bool)
+#: (col, row) corners and width of the vessels, pixels
+VESSELS = (
+    (((40, 60), (200, 150), (360, 330)), 17),
+    (((200, 150), (220, 370)), 9),
+    (((120, 105), (60, 300)), 3),
+)
+
+
+def drawn(depth: bool) -> tuple[Image, Mask]:
+    """Bright vessels on 0: flat areas of 1, or as deep as round ones; and where they are."""
+    row, col = np.indices((SIDE, SIDE))
+    out = np.zeros((SIDE, SIDE))
+    for corners, width in VESSELS:
+        for (x0, y0), (x1, y1) in itertools.pairwise(corners):
+            t = ((col - x0) * (x1 - x0) + (row - y0) * (y1 - y0)) / (
+                (x1 - x0) ** 2 + (y1 - y0) ** 2
+            )
+            t = np.clip(t, 0, 1)
+            off = np.hypot(col - x0 - t * (x1 - x0), row - y0 - t * (y1 - y0))
+            chord = np.sqrt(np.clip(1 - (off / (width / 2)) ** 2, 0, None)) * width / 17
+            out = np.maximum(out, chord)
+    mask = out > 0
+    return (out if depth else mask.astype(float)).astype(np.float32), mask
+
+
+def dice(a: Mask, b: Mask) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
+
+
+@pytest.mark.parametrize("depth", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_the_whole_tree_is_seen_to_the_rim(depth: bool, noise: float) -> None:
+    picture, mask = drawn(depth)
+    grain = np.random.default_rng(1).normal(0, noise, picture.shape)
+    found = shadow((7 + 40 * (picture + grain)).astype(np.float32), NO_HOLES)
+    assert found is not None
+    assert found.flat is not depth
+    assert dice(found.mask, mask) > 0.97
+
+
+def test_gain_and_offset_change_nothing() -> None:
+    picture, _ = drawn(True)
+    one, other = (shadow(p.astype(np.float32), NO_HOLES) for p in (picture, 300 * picture - 80))
+    assert one is not None
+    assert other is not None
+    assert np.array_equal(one.mask, other.mask)
+
+
+def test_letters_are_no_vessel() -> None:
+    picture, mask = drawn(False)
+    corner = np.s_[:45, 290:]
+    written = picture.astype(np.uint8)
+    cv2.putText(written, "LAO", (300, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
+    found = shadow(written.astype(np.float32), NO_HOLES)
+    assert found is not None
+    assert not found.mask[corner].any()
+    assert dice(found.mask, mask) > 0.99
+
+
+@pytest.mark.parametrize("what", ["noisy", "shaded", "blob", "both ways", "holes"])
+def test_other_pictures_are_left_to_the_filters(what: str) -> None:
+    picture, _ = drawn(True)
+    row, col = np.indices(picture.shape) / SIDE
+    holes = NO_HOLES
+    if what == "noisy":
+        picture = picture + np.random.default_rng(2).normal(0, 0.08, picture.shape)
+    if what == "shaded":
+        picture = picture + col
+    if what == "blob":  # half of the picture is saturated, the rest is anatomy
+        picture = picture + (np.hypot(row - 0.7, col - 0.2) < 0.2)
+    if what == "both ways":
+        picture = picture - 0.5 * (row < 0.1)
+    if what == "holes":
+        holes = ~NO_HOLES
+    assert shadow(picture.astype(np.float32), holes) is None
+
+
+@pytest.mark.parametrize(("depth", "kind"), [(False, "mask"), (True, "raw")])
+@pytest.mark.parametrize("dark", [True, False])
+def test_a_drawn_tree_is_read_without_any_model(depth: bool, kind: str, dark: bool) -> None:
+    picture, mask = drawn(depth)
+    grey = 20 + 200 * (1 - picture if dark else picture)
+    seen = Angiogram.without_geometry(
+        "1", (np.rint(grey).astype(np.float32), 8, ""), Intensity(kind="raw"), 0.3
+    )
+    found = extract_vessels(seen, ImagingOptions(segmenter="classic"))
+    assert found.kind == kind
+    assert dice(found.mask, mask) > 0.95
+    # A vessel of 17 pixels is 17 pixels deep in its middle.
+    line = found.skeleton & (cv2.distanceTransform(mask.astype(np.uint8), 2, 5) > 7)
+    assert np.median(found.path_mm[line]) == pytest.approx(17 * 0.3, rel=0.15)
