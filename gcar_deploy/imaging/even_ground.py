@@ -7,13 +7,14 @@ pixels are one grey value. What stands out of it is vessel, to the rim, however 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.segment import PART_SHARE
-from gcar_deploy.types import Image, Mask
+from gcar_deploy.types import Array, Image, Mask
 
 #: the ground is even if the robust standard deviation of all pixels is at most this share of the
 #: deepest vessels, and hardly any pixel stands out the other way
@@ -26,6 +27,12 @@ RIM_SHARE = 0.2
 _AREA, _HALF_WIDTH = 0.3, 0.06
 #: a shadow is flat where this share of it is nearly as dark as its darkest part
 _FLAT_SHARE, _NEARLY = 0.8, 0.9
+#: a smooth ground: degree of the surface along each axis, cells it is fitted to, rounds of the fit
+_DEGREE, _CELLS, _ROUNDS = 4, 32, 8
+#: rows and columns that tell whether the ground is even
+_SAMPLES = 200
+#: grain is blurred by so much until the ground is even
+_BLURS_PX = (0.0, 1.0, 2.0)
 #: middles are averaged over so much of the line, pixels
 _ALONG_PX = 3.0
 
@@ -52,22 +59,50 @@ def shadow(picture: Image, holes: Mask) -> Shadow | None:
     picture : (rows, cols) float32, vessels bright, any scale and offset
     holes : (rows, cols) bool, pixels without picture
     """
-    if holes.all():
+    step = max(1, min(picture.shape) // _SAMPLES)
+    seen = ~holes[::step, ::step]
+    if not seen.any():
         return None
-    seen = picture[~holes].astype(np.float64)
-    ground = float(np.median(seen))
-    rise = np.where(holes, 0.0, picture - ground).astype(np.float32)
-    deepest = float(np.percentile(rise, 99.9))
-    spread = 1.4826 * float(np.median(np.abs(seen - ground)))
-    if deepest <= 0 or spread > _SPREAD * deepest:
-        return None
+    for ground in _grounds(picture, holes):
+        sharp = np.where(holes, 0.0, picture - ground).astype(np.float32)
+        for blur in _BLURS_PX:
+            rise = cv2.GaussianBlur(sharp, (0, 0), blur) if blur else sharp
+            few = rise[::step, ::step][seen]
+            deepest = float(np.percentile(few, 99.9))
+            spread = 1.4826 * float(np.median(np.abs(few)))
+            if deepest > 0 and spread <= _SPREAD * deepest:
+                return _of_rise(np.asarray(rise, np.float32), spread, deepest)
+    return None
+
+
+def _grounds(picture: Image, holes: Mask) -> Iterator[Array | float]:
+    """Yield one grey value, then a smooth surface: a light that falls off to the borders."""
+    yield float(np.median(picture[~holes]))
+    size = (_CELLS, _CELLS)
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+    seen = cv2.resize(holes.astype(np.float32), size, interpolation=cv2.INTER_AREA) == 0
+    at = [np.linspace(-1, 1, n) for n in (_CELLS, *picture.shape)]
+    one, rows, columns = (np.polynomial.chebyshev.chebvander(x, _DEGREE) for x in at)
+    terms = np.einsum("ia,jb->ijab", one, one).reshape(_CELLS**2, -1)
+    used = seen.ravel()
+    for _ in range(_ROUNDS):
+        if used.sum() < 2 * terms.shape[1]:
+            return
+        surface = np.linalg.lstsq(terms[used], small.ravel()[used], rcond=None)[0]
+        off = small.ravel() - terms @ surface
+        # Vessels stand out to one side alone.
+        used = seen.ravel() & (off <= 1.4826 * np.median(np.abs(off[used])))
+    yield rows @ surface.reshape(_DEGREE + 1, _DEGREE + 1) @ columns.T
+
+
+def _of_rise(rise: Image, spread: float, deepest: float) -> Shadow | None:
     floor = max(_DEVIATIONS * spread, _LEAST * deepest)
     if float((rise < -floor).mean()) > _OTHER_WAY:
         return None
     reach = rise > floor
     line = skel.skeletonize(reach)
     half_width = cv2.distanceTransform(reach.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    wide = half_width.max() > _HALF_WIDTH * min(picture.shape)
+    wide = half_width.max() > _HALF_WIDTH * min(rise.shape)
     if not line.any() or reach.mean() > _AREA or wide:
         return None
     kept = skel.strong_parts(line, rise, PART_SHARE)

@@ -16,7 +16,7 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.border import cut_out, put_back, shown_box
 from gcar_deploy.imaging.edits import edited
-from gcar_deploy.imaging.fusion import fused
+from gcar_deploy.imaging.fusion import fused, without_device
 from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
@@ -104,8 +104,7 @@ def _seen(
     grey = _grey_values(angiogram)
     drawn = even_ground.shadow(grey[0]["linear"], grey[1])
     if drawn is not None:
-        seen = dataclasses.replace(angiogram, mask=drawn.mask)
-        return _from_drawn(seen, drawn.mask) if drawn.flat else _from_grey(seen, grey, None)
+        return _from_shadow(angiogram, grey, drawn)
     if segmenter is None or options.segmenter == "classic":
         return _from_grey(angiogram, grey, None)
     if options.segmenter == "net":
@@ -138,6 +137,17 @@ def _from_both(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter) -> Vesse
         return fused(_from_grey(angiogram, grey, None), learned)
     except RefusedError:
         return learned
+
+
+def _from_shadow(angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow) -> VesselImage:
+    """Vessels on an even ground, without what the ridge filter takes for a catheter."""
+    seen = dataclasses.replace(angiogram, mask=drawn.mask)
+    view = _from_drawn(seen, drawn.mask) if drawn.flat else _from_grey(seen, grey, None)
+    try:
+        filtered = _from_grey(angiogram, grey, None)
+    except RefusedError:
+        return view
+    return without_device(view, filtered.catheter, filtered.catheter_mm)
 
 
 def _needed(segmenter: Segmenter | None) -> Segmenter:

@@ -65,6 +65,14 @@ def _without(view: VesselImage, device: Mask | None) -> VesselImage:
     )
 
 
+def without_device(view: VesselImage, device: Mask | None, length_mm: float) -> VesselImage:
+    """Cut the lines that lie on a device, and say where it is and how long."""
+    left = _without(view, device)
+    if device is None:
+        return left
+    return dataclasses.replace(left, catheter=device & ~left.mask, catheter_mm=length_mm)
+
+
 def _either(classic: VesselImage, learned: VesselImage, mask: Mask) -> Mask:
     found = [view.catheter for view in (classic, learned) if view.catheter is not None]
     return np.logical_or.reduce([np.zeros_like(mask), *found]) & ~mask

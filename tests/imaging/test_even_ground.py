@@ -76,15 +76,29 @@ def test_letters_are_no_vessel() -> None:
     assert dice(found.mask, mask) > 0.99
 
 
-@pytest.mark.parametrize("what", ["noisy", "shaded", "blob", "both ways", "holes"])
+@pytest.mark.parametrize("noise", [0.0, 0.06])
+def test_light_may_fall_off_and_grain_may_be_coarse(noise: float) -> None:
+    picture, mask = drawn(True)
+    row, col = np.indices(picture.shape) / SIDE
+    light = 2.0 - (row - 0.4) ** 2 - 0.7 * col
+    grain = np.random.default_rng(3).normal(0, noise, picture.shape)
+    found = shadow((picture - light + grain).astype(np.float32), NO_HOLES)
+    assert found is not None
+    assert dice(found.mask, mask) > 0.9
+
+
+@pytest.mark.parametrize("what", ["noisy", "cloudy", "blob", "both ways", "holes"])
 def test_other_pictures_are_left_to_the_filters(what: str) -> None:
     picture, _ = drawn(True)
     row, col = np.indices(picture.shape) / SIDE
     holes = NO_HOLES
     if what == "noisy":
-        picture = picture + np.random.default_rng(2).normal(0, 0.08, picture.shape)
+        picture = picture + np.random.default_rng(2).normal(0, 0.4, picture.shape)
     if what == "shaded":
         picture = picture + col
+    if what == "cloudy":
+        cloud = cv2.GaussianBlur(np.random.default_rng(4).normal(0, 1, picture.shape), (0, 0), 12)
+        picture = picture + 0.2 * cloud / cloud.std()
     if what == "blob":  # half of the picture is saturated, the rest is anatomy
         picture = picture + (np.hypot(row - 0.7, col - 0.2) < 0.2)
     if what == "both ways":
