@@ -28,6 +28,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
+from gcar_deploy.plain import plain
 from gcar_deploy.pose import Pose
 from gcar_deploy.quality import Quality, part_lengths_mm, unexplained
 from gcar_deploy.tree.tree import Branch, Tree, along
@@ -404,24 +405,3 @@ def _sigma(branch: Branch, carms: Sequence[CArm]) -> dict[str, float | None]:
     axes = depth_and_plane(branch.covariance_mm2.sum(axis=1), branch.points_mm, carms)
     means = (float(sigma.mean()) for sigma in (*branch.sigma_parts_mm.T, *axes))
     return dict(zip(names, means, strict=True))
-
-
-def plain(value: Any, path: str, reasons: dict[str, str]) -> Any:
-    """Turn numbers, arrays, tuples and mappings into strict JSON values.
-
-    What is undefined becomes null; ``reasons`` then says why under its JSON pointer.
-    """
-    if isinstance(value, Mapping):
-        return {str(k): plain(v, f"{path}/{k}", reasons) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v, f"{path}/{k}", reasons) for k, v in enumerate(value)]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist(), path, reasons)
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        reasons[path] = "not finite"
-        return None
-    if value is None and not path.startswith("/options"):
-        reasons.setdefault(path, "not determined")
-    return value

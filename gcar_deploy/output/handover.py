@@ -28,7 +28,7 @@ from gcar_deploy.output.folder import write_folder
 from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.output.tracts import tracts_vtp
 from gcar_deploy.output.vtp import triangle_data
-from gcar_deploy.reconstruction import plain
+from gcar_deploy.plain import plain
 from gcar_deploy.tree.open_surface import End, OpenSurface, open_surface
 from gcar_deploy.tree.tree import Tree
 

@@ -321,7 +321,7 @@ MUTANTS = (
     ),
     Mutant(
         "measures: what is undefined is 0",
-        "gcar_deploy/reconstruction.py",
+        "gcar_deploy/plain.py",
         'reasons[path] = "not finite"\n        return None',
         "return 0.0",
         ("tests/output/test_files.py",),

@@ -17,7 +17,7 @@ from gcar_deploy.measure.measured import measured
 from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.tables import centerline_vtp, gaussians_ply
 from gcar_deploy.output.volume import nifti_bytes
-from gcar_deploy.reconstruction import plain
+from gcar_deploy.plain import plain
 
 
 @pytest.mark.req("REQ-25")
