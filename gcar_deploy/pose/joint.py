@@ -36,6 +36,8 @@ from gcar_deploy.types import Array, Scalars
 #: offsets are sought together
 LEAST_APART_DEG = 10.0
 STARTS = 60
+#: steps of that search at most, and the drop of the misfit (in variances) that ends it
+NEWTON_STEPS, LEAST_GAIN = 60, 1e-6
 #: differences of profiles that are kept, some 10 kB each
 MOST_KNOWN = 256
 #: more views than this are corrected pair by pair alone
@@ -189,11 +191,12 @@ class _Problem:
         """
         # Of three and more views alone, and 0.1 s to import.
         from scipy.interpolate import CubicSpline
-        from scipy.optimize import minimize
 
         steps = np.arange(-2 * SEARCH_MM, 2 * SEARCH_MM + 1e-9, STEP_MM)
-        zero, curves, normals = np.zeros_like(first), [], []
-        for i, j in self.pairs:
+        zero, curves = np.zeros_like(first), []
+        # Row by row, how far the offsets of views 1, 2, ... move a pair along its normal.
+        along = np.zeros((len(self.pairs), len(first), 3))
+        for row, (i, j) in enumerate(self.pairs):
             fixed, moving, _ = self.pair(i, j, zero)
             normal = plane_normal(fixed.carm, moving.carm)
             misfit = []
@@ -203,30 +206,14 @@ class _Problem:
                 apart = self.differences(i, j, at, self.options.coarse_mm) / self.noise
                 misfit.append(float(np.sum(apart**2)))
             curves.append(CubicSpline(steps, misfit, bc_type="clamped").c)
-            normals.append(normal)
-        # (4, intervals, pairs) coefficients of all curves, and which views each pair holds.
-        cubic, which = np.stack(curves, axis=2), np.arange(len(curves))
-        normal_of, (first_of, second_of) = np.stack(normals), np.array(self.pairs).T
-        sign = np.zeros((len(first), len(which)))
-        sign[second_of, which], sign[first_of, which] = 1.0, -1.0
-
-        def cost(x: Array) -> tuple[float, Array]:
-            d = np.vstack([np.zeros(3), x.reshape(-1, 3)])
-            along = np.einsum("ij,ij->i", normal_of, d[second_of] - d[first_of])
-            along = np.minimum(np.maximum(along, steps[0]), steps[-1])
-            piece = np.minimum(((along - steps[0]) / STEP_MM).astype(np.int64), len(steps) - 2)
-            h, (a, b, c, e) = along - steps[piece], cubic[:, piece, which]
-            value = float(np.sum((d / OFFSET_MM) ** 2) + np.sum(((a * h + b) * h + c) * h + e))
-            pull = (3.0 * a * h + 2.0 * b) * h + c
-            slope = 2.0 * d / OFFSET_MM**2 + sign @ (pull[:, None] * normal_of)
-            return value, slope[1:].ravel()
-
+            along[row, j], along[row, i] = normal, -normal
         rng = np.random.default_rng(0)
         spread = rng.normal(0.0, 2.0 * OFFSET_MM, (STARTS, 3 * (len(first) - 1)))
-        starts = [first[1:, :3].ravel(), np.zeros(3 * (len(first) - 1)), *spread]
-        found = [minimize(cost, s, jac=True, method="L-BFGS-B") for s in starts]
+        starts = np.stack([first[1:, :3].ravel(), np.zeros(spread.shape[1]), *spread])
         out = zero.copy()
-        out[1:, :3] = min(found, key=lambda f: float(f.fun)).x.reshape(-1, 3)
+        out[1:, :3] = _lowest(
+            starts, along[:, 1:].reshape(len(curves), -1), np.stack(curves, axis=2), steps
+        ).reshape(-1, 3)
         return out
 
     def fitted(self, theta: Array) -> tuple[Array, bool]:
@@ -254,3 +241,46 @@ class _Problem:
 def _with_first(x: Array) -> Array:
     """(V, 5) corrections from the unknowns: the first view stays."""
     return np.vstack([np.zeros(5), x.reshape(-1, 5)])
+
+
+def _lowest(starts: Array, along: Array, cubic: Array, steps: Scalars) -> Scalars:
+    """(n,) offsets with the least misfit, by damped Newton steps from all starts at once.
+
+    Parameters
+    ----------
+    starts : (S, n) offsets, mm
+    along : (P, n) so that ``along @ x`` are the shifts of the P pairs, mm
+    cubic : (4, intervals, P) coefficients of each pair's misfit against its shift
+    steps : (intervals + 1,) shifts in mm at which the intervals meet, evenly; constant beyond
+    """
+    which = np.arange(len(along))
+
+    def told(x: Array) -> tuple[Scalars, Array, Array]:
+        """Misfit (S,), and slope and curvature of every pair's share of it (S, P)."""
+        shift = np.minimum(np.maximum(x @ along.T, steps[0]), steps[-1])
+        piece = ((shift - steps[0]) / (steps[1] - steps[0])).astype(np.int64)
+        piece = np.minimum(piece, len(steps) - 2)
+        h, (a, b, c, e) = shift - steps[piece], cubic[:, piece, which]
+        value = np.sum((x / OFFSET_MM) ** 2, axis=1) + np.sum(((a * h + b) * h + c) * h + e, axis=1)
+        return value, (3.0 * a * h + 2.0 * b) * h + c, 6.0 * a * h + 2.0 * b
+
+    x, share = starts, np.ones(len(starts))
+    value, slope, bend = told(x)
+    prior = 2.0 / OFFSET_MM**2
+    for _ in range(NEWTON_STEPS):
+        # The curvature's size: where it is negative too, the step goes downhill.
+        H = np.einsum("sp,pi,pj->sij", np.abs(bend), along, along) + prior * np.eye(x.shape[1])
+        step = np.linalg.solve(H, (prior * x + slope @ along)[..., None])[..., 0]
+        trial = x - share[:, None] * step
+        then, *rest = told(trial)
+        better = then < value
+        gain = np.max(np.where(better, value - then, 0.0))
+        share = np.where(better, np.minimum(2.0 * share, 1.0), 0.25 * share)
+        x, value = np.where(better[:, None], trial, x), np.where(better, then, value)
+        slope, bend = (
+            np.where(better[:, None], n, o) for n, o in zip(rest, (slope, bend), strict=True)
+        )
+        if better.any() and gain < LEAST_GAIN:
+            break
+    lowest: Scalars = x[np.argmin(value)]
+    return lowest
