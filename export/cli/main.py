@@ -15,7 +15,7 @@ from gcar_export.cli.centers import centers_table, robustness
 from gcar_export.cli.evaluate import converge, evaluate, paper_page
 from gcar_export.cli.frames import frame_pairs
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
-from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table
+from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table, speed_table
 from gcar_export.cli.wrong_scenes import wrong_scenes
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -302,6 +302,7 @@ for _verb in (
     robustness,
     refine_table,
     cost_curves,
+    speed_table,
     sigma_table,
     flow_table,
     gate_table,

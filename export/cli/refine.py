@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from gcar_deploy.errors import UsageError
 from gcar_export.cli.evaluate import words
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
 @click.command("refine-table")
@@ -62,6 +64,40 @@ def cost_curves() -> None:
     with click.progressbar(length=total, label="sizes", file=sys.stderr) as bar:
         found = cost.curves(lambda: bar.update(1), timed)
     click.echo(cost.table(found))
+
+
+@click.command("speed-table")
+@click.argument("labels", type=_FILE, nargs=-1, required=True)
+@click.option("--protocol", default="paper", show_default=True, help="paper, clinical or raw.")
+@click.option("--rounds", type=click.IntRange(1, 100), default=3, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in place of the table.")
+@click.option("--picture", type=click.Path(path_type=Path), help="New PNG: pairs against DSC.")
+def speed_table(
+    labels: tuple[Path, ...], protocol: str, rounds: int, as_json: bool, picture: Path | None
+) -> None:
+    """Time settings and peers in one run, beside itk-rtk pairs of the same size.
+
+    Every round runs gcar over predictor, lattices and refiner, and FDK, SART, visual hull and a
+    short NeRP, once on each label volume, warm. Stars: the Pareto front of pairs against DSC.
+
+    Example: gcar-export speed-table data/imagecas/0001.label.nii.gz --picture speed.png
+    """
+    from gcar_export.scenes.labels import read_label
+    from gcar_export.scenes.protocols import PROTOCOLS, make_case
+    from gcar_export.studies import speed_table as speed
+
+    if protocol not in PROTOCOLS:
+        raise UsageError(f"--protocol {protocol} is none of {', '.join(PROTOCOLS)}")
+    if picture is not None and picture.exists():
+        raise UsageError(f"{picture} exists")
+    cases = [make_case(read_label(path), protocol) for path in labels]
+    asked = speed.settings()
+    length = len(cases) * len(asked) * rounds
+    with click.progressbar(length=length, label="runs", file=sys.stderr) as bar:
+        made = speed.rows(cases, asked, rounds, lambda: bar.update(1))
+    click.echo(json.dumps(speed.values(made), indent=1) if as_json else speed.table(made))
+    if picture is not None:
+        speed.picture(made).savefig(picture, dpi=100)
 
 
 @click.command("sigma-table")
