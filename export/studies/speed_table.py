@@ -8,6 +8,7 @@ multiple of the pair; seconds are those of this machine at this hour.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from gcar_deploy.measure.metrics import chamfer_mm, skeleton, volume_dice
 from gcar_deploy.types import Volume
-from gcar_export.evaluate.plots import figure
+from gcar_export.evaluate.plots import MARKERS, figure
 from gcar_export.methods.nerp import NerpOptions
 from gcar_export.methods.rtk_timing import projection_pair
 from gcar_export.methods.settings import MethodSettings
@@ -159,18 +160,15 @@ def picture(made: Sequence[Row]) -> Figure:
     axis = fig.subplots()
     best = list(front(made))
     axis.plot([r.pairs for r in best], [100 * r.dsc for r in best], color="#444444", lw=1)
-    for row in made:
-        axis.plot(row.pairs, 100 * row.dsc, "o" if row.stages else "s", ms=6, mec="black", mew=0.6)
-        axis.annotate(
-            row.setting, (row.pairs, 100 * row.dsc), xytext=(6, 3), textcoords="offset points",
-            fontsize=7,
-        )  # fmt: skip
+    for row, marker in zip(made, itertools.cycle(MARKERS), strict=False):
+        label = f"{row.setting}: {row.pairs:.1f}"
+        axis.plot(row.pairs, 100 * row.dsc, marker, ms=7, mec="black", mew=0.6, label=label)
     axis.set_xscale("log")
     axis.set_xlabel("itk-rtk forward + back projection pairs")
     axis.set_ylabel("volume DSC(0.5), %")
-    axis.margins(x=0.18)
     axis.grid(which="both", alpha=0.2)
-    axis.set_title("Speed against error in one run; line: Pareto front; squares: peers")
+    axis.set_title("Speed against error in one run; line: Pareto front")
+    fig.legend(loc="outside right center", frameon=False)
     return fig
 
 
