@@ -15,7 +15,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.landmarks import landmark_pixels
-from gcar_deploy.pose.motion import STILL, estimate_motion
+from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
 from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
@@ -123,7 +123,8 @@ def with_motion(
     Where there is some, the correction is estimated anew together with it; see ``motion``.
     """
     exact = all(view.calibrated for view in views)
-    if len(views) != 2 or not (options.pose.enabled and exact) or poses[1].after <= STILL:
+    rest = still(max(view.carm.pixel_at_isocenter_mm for view in views))
+    if len(views) != 2 or not (options.pose.enabled and exact) or poses[1].after <= rest:
         return tuple(poses)
     masses, smoothing = profiled(views, options)
     fixed, moving = masses

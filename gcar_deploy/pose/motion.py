@@ -36,8 +36,9 @@ from gcar_deploy.types import Array, Image, Mask, Pixels, Scalars
 MOTION_MM, ALIKE_MM = 2.0, 50.0
 #: modes that are estimated, and pixels that they are worked out from
 MODES, NODES = 16, 300
-#: views that disagree by no more than this once they are placed have not moved, 0 .. 1
-STILL = 0.01
+#: views that disagree by no more than this once they are placed have not moved, 0 .. 1; coarse
+#: pixels alone make so much of it per mm (``still``)
+STILL, STILL_PER_MM = 0.01, 0.03
 #: motion is believed where it lowers the disagreement to this share, and to no more than this, and
 #: where its root mean square is no more than two standard deviations. Of vessels that are strained
 #: as well the mass per plane changes by some hundredths, which no field over the picture mends
@@ -137,6 +138,11 @@ class Motion:
             for part in (coarse[:, :, 0], coarse[:, :, 1])
         )
         return column + dx, row + dy
+
+
+def still(pixel_mm: float) -> float:
+    """Disagreement of two placed pictures, 0 .. 1, up to which nothing has moved."""
+    return max(STILL, STILL_PER_MM * pixel_mm)
 
 
 def estimate_motion(
