@@ -45,10 +45,12 @@ class Shadow:
     ----------
     mask : (rows, cols) bool
     flat : bool, of one grey value: it shows where vessels are and nothing of their depth
+    shaded : bool, the ground is a smooth surface: less light falls on some of the picture
     """
 
     mask: Mask
     flat: bool
+    shaded: bool
 
 
 def shadow(picture: Image, holes: Mask) -> Shadow | None:
@@ -63,7 +65,7 @@ def shadow(picture: Image, holes: Mask) -> Shadow | None:
     seen = ~holes[::step, ::step]
     if not seen.any():
         return None
-    for ground in _grounds(picture, holes):
+    for shaded, ground in enumerate(_grounds(picture, holes)):
         sharp = np.where(holes, 0.0, picture - ground).astype(np.float32)
         for blur in _BLURS_PX:
             rise = cv2.GaussianBlur(sharp, (0, 0), blur) if blur else sharp
@@ -71,7 +73,8 @@ def shadow(picture: Image, holes: Mask) -> Shadow | None:
             deepest = float(np.percentile(few, 99.9))
             spread = 1.4826 * float(np.median(np.abs(few)))
             if deepest > 0 and spread <= _SPREAD * deepest:
-                return _of_rise(np.asarray(rise, np.float32), spread, deepest)
+                found = _of_rise(np.asarray(rise, np.float32), spread, deepest)
+                return found and Shadow(*found, shaded=bool(shaded))
     return None
 
 
@@ -95,7 +98,8 @@ def _grounds(picture: Image, holes: Mask) -> Iterator[Array | float]:
     yield rows @ surface.reshape(_DEGREE + 1, _DEGREE + 1) @ columns.T
 
 
-def _of_rise(rise: Image, spread: float, deepest: float) -> Shadow | None:
+def _of_rise(rise: Image, spread: float, deepest: float) -> tuple[Mask, bool] | None:
+    """Mask of what stands out, and whether it is flat; None where these are no lines."""
     floor = max(_DEVIATIONS * spread, _LEAST * deepest)
     if float((rise < -floor).mean()) > _OTHER_WAY:
         return None
@@ -109,4 +113,4 @@ def _of_rise(rise: Image, spread: float, deepest: float) -> Shadow | None:
     _, (peak,) = skel.spread(line, (rise,), _ALONG_PX)
     mask = ((rise > RIM_SHARE * peak) | kept) & skel.beside(reach, line, kept)
     dark = rise[mask] >= _NEARLY * deepest
-    return Shadow(mask, bool(dark.mean() >= _FLAT_SHARE))
+    return mask, bool(dark.mean() >= _FLAT_SHARE)

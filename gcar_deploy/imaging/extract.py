@@ -142,6 +142,8 @@ def _from_both(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter) -> Vesse
 def _from_shadow(angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow) -> VesselImage:
     """Vessels on an even ground, without what the ridge filter takes for a catheter."""
     seen = dataclasses.replace(angiogram, mask=drawn.mask)
+    if drawn.shaded and "log" in grey[0]:  # half of the light is half of the contrast
+        grey = {name: grey[0][name] for name in ("search", "log")}, grey[1]
     view = _from_drawn(seen, drawn.mask) if drawn.flat else _from_grey(seen, grey, None)
     try:
         filtered = _from_grey(angiogram, grey, None)
