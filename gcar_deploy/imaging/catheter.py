@@ -1,6 +1,7 @@
 """Catheters among the lines found: even, unbranched, from the border to a wider vessel.
 
-Leads and wires that cross the whole field go with them.
+Leads and wires that cross the whole field go with them, and shafts that are none but by their
+course (``shaft``).
 
 A catheter enters the field at its border, keeps its width to the tip, and ends at the ostium,
 where the vessel that it fills is wider. A vessel that leaves the field tapers towards the
@@ -16,6 +17,7 @@ import numpy as np
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
+from gcar_deploy.imaging.shaft import shaft
 from gcar_deploy.types import Image, Mask, Scalars
 
 #: a catheter comes within this distance of the border of the field, mm
@@ -95,9 +97,12 @@ def catheters(
     for pixels in _crossings(graph, ends, min(line.shape)):
         found[tuple(np.transpose(pixels))] = True
     crossing = found
-    cuts = [_cut(graph, end, width, widest, inward, pixel_mm) for end in ends if not found[end]]
-    # The clearest first, as long as most of the line stays.
-    for _, pixels in sorted((c for c in cuts if c is not None), reverse=True):
+    free = [end for end in ends if not found[end]]
+    cuts = [_cut(graph, end, width, widest, inward, pixel_mm) for end in free]
+    shafts = [shaft(graph, end, width, widest, pixel_mm) for end in free]
+    # The clearest first, then the longest, as long as most of the line stays.
+    clearest = [pixels for _, pixels in sorted((c for c in cuts if c is not None), reverse=True)]
+    for pixels in [*clearest, *sorted(filter(None, shafts), key=len, reverse=True)]:
         tried = found.copy()
         tried[tuple(np.transpose(pixels))] = True
         if (tried & ~crossing).sum() * pixel_mm <= LARGEST_SHARE * total_mm:

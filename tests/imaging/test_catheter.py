@@ -18,6 +18,7 @@ from gcar_deploy.imaging.linegraph import LineGraph
 from gcar_deploy.imaging.net import Seen
 from gcar_deploy.imaging.pictures import vessel_pictures
 from gcar_deploy.imaging.resample import resized
+from gcar_deploy.imaging.shaft import shaft
 from gcar_deploy.imaging.skeleton import skeletonize
 from tests.imaging.phantoms import angiogram, raw_picture
 
@@ -209,3 +210,46 @@ def test_the_graph_of_a_line():
     assert far[5, 10] == pytest.approx(10) and far[2, 5] == pytest.approx(6)
     assert graph.shortest(far, (2, 5)) == [(4, 1), (4, 2), (4, 3), (4, 4), (4, 5), (3, 5), (2, 5)]
     assert len(graph.branches(far, 5, 6)) == 2
+
+
+def _course(wriggle=0.0, rows=200):
+    """(rows, 100) line from the upper border: a quarter of a wave, and a wriggle on it, pixels."""
+    row = np.arange(rows)
+    column = 20 + 40 * np.sin(row / 130) + wriggle * np.sin(row / 5)
+    return _lines(np.stack([column, row], 1), shape=(200, 100))
+
+
+@pytest.mark.parametrize(
+    ("line", "first", "last", "is_one"),
+    [
+        (_course, 2.4, 2.4, True),
+        (_course, 2.4, 2.0, False),  # tapers
+        (_course, 4.0, 4.0, False),  # as wide as the main vessels
+        (lambda: _course(wriggle=2.5), 2.4, 2.4, False),
+        (lambda: _course(rows=50), 2.4, 2.4, False),  # short
+    ],
+)
+def test_a_shaft_is_long_even_smooth_and_thinner_than_the_main_vessels(line, first, last, is_one):
+    line = line()
+    graph = LineGraph(line)
+    end = graph.ends(line)[0]
+    width = np.repeat(np.linspace(first, last, 200, dtype=np.float32)[:, None], 100, axis=1)
+    found = shaft(graph, end, width, 5.0, _MM)
+    assert len(found) == (line.sum() if is_one else 0)
+
+
+def test_a_shaft_ends_where_it_widens_or_meets_another_line():
+    crossed = _course() | _lines([(2, 120), (98, 124)], shape=(200, 100))
+    width = np.full(crossed.shape, 2.4, np.float32)
+    width[140:] = 4.0
+    for line, last in ((_course(), range(130, 145)), (crossed, range(115, 127))):
+        graph = LineGraph(line)
+        end = next(p for p in graph.ends(line) if p[0] == 0)
+        assert max(row for row, _ in shaft(graph, end, width, 5.0, _MM)) in last
+
+
+def _lines(*ways, shape=(60, 60)):
+    line = np.zeros(shape, np.uint8)
+    for way in ways:
+        cv2.polylines(line, [np.array(way, np.int32)], False, 1)
+    return skeletonize(line > 0)
