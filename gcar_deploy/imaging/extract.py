@@ -39,7 +39,8 @@ MASK_ERROR = 0.3
 PATH_THRESHOLD_PIXELS = 0.1
 #: less skeleton than this, or a weaker peak in noise deviations, is no vessel; the network tells
 #: faint vessels from noise by their shape
-MIN_LENGTH_MM = 25.0
+#: on an even ground nothing but vessel stands out, however small the pixel is said to be
+MIN_LENGTH_MM, EVEN_LENGTH_MM = 25.0, 10.0
 MIN_CONTRAST, NET_MIN_CONTRAST = 6.0, 3.0
 #: and the peak, as a share of the white level, must be seen at all
 MIN_PEAK = 0.03
@@ -144,7 +145,10 @@ def _from_shadow(angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow) -
     seen = dataclasses.replace(angiogram, mask=drawn.mask)
     if drawn.shaded and "log" in grey[0]:  # half of the light is half of the contrast
         grey = {name: grey[0][name] for name in ("search", "log")}, grey[1]
-    view = _from_drawn(seen, drawn.mask) if drawn.flat else _from_grey(seen, grey, None)
+    if drawn.flat:
+        view = _from_drawn(seen, drawn.mask, EVEN_LENGTH_MM)
+    else:
+        view = _from_grey(seen, grey, None, EVEN_LENGTH_MM)
     try:
         filtered = _from_grey(angiogram, grey, None)
     except RefusedError:
@@ -209,13 +213,13 @@ def _from_mask(angiogram: Angiogram) -> VesselImage:
     return _from_drawn(dataclasses.replace(angiogram, valid=valid), mask)
 
 
-def _from_drawn(angiogram: Angiogram, mask: Mask) -> VesselImage:
+def _from_drawn(angiogram: Angiogram, mask: Mask, least_mm: float = MIN_LENGTH_MM) -> VesselImage:
     line = skel.skeletonize(mask)
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
-    if line.sum() * pixel_mm < MIN_LENGTH_MM:
+    if line.sum() * pixel_mm < least_mm:
         raise _nothing(
             angiogram,
-            f"{line.sum() * pixel_mm:.0f} mm of line (needed: {MIN_LENGTH_MM:g} mm)",
+            f"{line.sum() * pixel_mm:.0f} mm of line (needed: {least_mm:g} mm)",
         )
     return VesselImage(
         view_id=angiogram.view_id,
@@ -251,7 +255,10 @@ def _grey_values(angiogram: Angiogram) -> _Grey:
     return pictures, holes if angiogram.valid is None else holes | ~angiogram.valid
 
 
-def _from_grey(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter | None) -> VesselImage:
+def _from_grey(
+    angiogram: Angiogram, grey: _Grey, segmenter: Segmenter | None,
+    least_mm: float = MIN_LENGTH_MM,
+) -> VesselImage:  # fmt: skip
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     pictures, holes = grey
     search = pictures.get("search", next(iter(pictures.values())))
@@ -271,11 +278,11 @@ def _from_grey(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter | None) -
     least = MIN_CONTRAST if segmenter is None else NET_MIN_CONTRAST
     too_faint = found.contrast < least or found.peak < MIN_PEAK
     too_faint &= angiogram.mask is None  # who draws a mask has seen the vessel
-    if length < MIN_LENGTH_MM or too_faint:
+    if length < least_mm or too_faint:
         raise _nothing(
             angiogram,
             f"{length:.0f} mm of line, {found.peak:.1%} contrast, {found.contrast:.1f} times the "
-            f"noise (needed: {MIN_LENGTH_MM:g} mm, {MIN_PEAK:.0%}, "
+            f"noise (needed: {least_mm:g} mm, {MIN_PEAK:.0%}, "
             f"{least:g} times)",
         )
     if path_mm is None:
