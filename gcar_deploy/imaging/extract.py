@@ -92,20 +92,22 @@ def _found(
         return _from_mask(angiogram)
     if angiogram.mask is not None:
         return _from_grey(angiogram, _grey_values(angiogram), None)
-    box = shown_box(pixels)
-    return put_back(_seen(cut_out(angiogram, box), options, segmenter), angiogram, box)
+    if options.segmenter == "net":
+        segmenter = _needed(segmenter)
+    # A gradient along one side has equal rows, as a border has: the whole picture is asked first.
+    for box in dict.fromkeys(((0, pixels.shape[0], 0, pixels.shape[1]), shown_box(pixels))):
+        part = cut_out(angiogram, box)
+        grey = _grey_values(part)
+        drawn = even_ground.shadow(grey[0]["linear"], grey[1])
+        if drawn is not None:
+            return put_back(_from_shadow(part, grey, drawn), angiogram, box)
+    return put_back(_seen(part, grey, options, segmenter), angiogram, box)
 
 
 def _seen(
-    angiogram: Angiogram, options: ImagingOptions, segmenter: Segmenter | None
+    angiogram: Angiogram, grey: _Grey, options: ImagingOptions, segmenter: Segmenter | None
 ) -> VesselImage:
     """Find vessels in grey values, by whom the options name."""
-    if options.segmenter == "net":
-        segmenter = _needed(segmenter)
-    grey = _grey_values(angiogram)
-    drawn = even_ground.shadow(grey[0]["linear"], grey[1])
-    if drawn is not None:
-        return _from_shadow(angiogram, grey, drawn)
     if segmenter is None or options.segmenter == "classic":
         return _from_grey(angiogram, grey, None)
     if options.segmenter == "net":
