@@ -287,8 +287,8 @@ MUTANTS = (
     Mutant(
         "pictures: what is lost in the noise is a vessel",
         "gcar_deploy/imaging/extract.py",
-        "if length < MIN_LENGTH_MM or too_faint:",
-        "if length < MIN_LENGTH_MM:",
+        "if length < least_mm or too_faint:",
+        "if length < least_mm:",
         ("tests/imaging/test_extract.py",),
     ),
     Mutant(

@@ -27,13 +27,17 @@ HULL = RunOptions(predict=PredictOptions(predictor="none"))
 
 
 def raw_pair():
-    """The self-test's tree as raw pictures of 8 bits: Beer's law and a little noise."""
+    """The self-test's tree as raw pictures of 8 bits: Beer's law, a wavy ground, a little noise."""
     angiograms, grid, _ = tiny_case()
     pair = []
     for seed, one in enumerate(angiograms):
         path = one.pixels * one.intensity.mm_per_count
         noise = np.random.default_rng(seed).normal(0, 1, path.shape)
-        grey = np.clip(160 * np.exp(-0.15 * path) + noise, 0, 255).round().astype(np.float32)
+        row, col = np.indices(path.shape) / path.shape[0]
+        ground = 0.12 * np.sin(9 * row) * np.sin(25 * col)
+        grey = (
+            np.clip(160 * np.exp(-0.15 * path - ground) + noise, 0, 255).round().astype(np.float32)
+        )
         pair.append(dataclasses.replace(one, pixels=grey, intensity=Intensity(kind="raw")))
     return pair, grid
 
