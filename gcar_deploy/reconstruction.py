@@ -67,7 +67,7 @@ class Reconstruction:
     losses : objective after every accepted refinement step
     predictor, refiner : what was used
     model : name and SHA-256 of the centre predictor, None without one
-    segmenter : the same of the network that found vessels, None where none was asked
+    segmenter : the same of the network that found vessels, None where none did
     notes : sentences for the user that do not lower the status
     options : RunOptions
     ending : how the fit of the tubes ended, None where none were fitted
@@ -252,7 +252,7 @@ class Reconstruction:
         if self.ending is None:
             reasons["/fit"] = "no tubes were fitted"
         if self.segmenter is None:
-            reasons["/segmenter"] = "no network looked for vessels in the pictures"
+            reasons["/segmenter"] = "no network found vessels in the pictures"
         out["reasons"] = reasons
         return out
 

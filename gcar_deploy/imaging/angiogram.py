@@ -126,6 +126,8 @@ class VesselImage:
         What was taken for a catheter and left out of the mask; None where nobody looked.
     catheter_mm : float
         Length of its line.
+    by_network : bool
+        Whether the network's word is in it.
     """
 
     view_id: str
@@ -139,6 +141,7 @@ class VesselImage:
     vesselness: Image | None = None
     catheter: Mask | None = None
     catheter_mm: float = 0.0
+    by_network: bool = False
     others: tuple[VesselImage, ...] = ()
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ class Vessels:
     Attributes
     ----------
     views : V vessel images
-    segmenter : the network that was asked, or None
+    segmenter : the network whose word is in a view, or None
     findings : reasons for ``degraded``
     """
 
@@ -54,4 +54,5 @@ def find_vessels(
     used, missing = asked_network(angiograms, options, segmenter)
     watched = used and used.watched(watch.question)
     views = [extract_vessels(a, options, watched) for a in watch.each(angiograms, report)]
-    return Vessels(views=tuple(views), segmenter=used, findings=tuple(missing))
+    said = used if any(view.by_network for view in views) else None
+    return Vessels(views=tuple(views), segmenter=said, findings=tuple(missing))

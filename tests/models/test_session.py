@@ -54,13 +54,21 @@ def test_a_raw_pair_names_the_network_that_found_its_vessels(raw):
     assert f"{summary['segmenter']['sha256']}  segmenter.onnx" in manifest.splitlines()
 
 
-@pytest.mark.parametrize("case", ["path lengths", "masks", "classic"])
+@pytest.mark.parametrize("case", ["path lengths", "masks", "classic", "even ground"])
 def test_where_no_network_was_asked_none_is_named(case, raw):
     angiograms, grid = tiny_case()[:2] if case == "path lengths" else raw
     options = HULL
     if case == "masks":
         drawn = [a.pixels * a.intensity.mm_per_count > 0.3 for a in tiny_case()[0]]
         angiograms = [dataclasses.replace(a, mask=m) for a, m in zip(raw[0], drawn, strict=True)]
+    if case == "even ground":
+        angiograms = [
+            dataclasses.replace(
+                a,
+                pixels=np.rint(200 - 20 * drawn.pixels * drawn.intensity.mm_per_count),
+            )
+            for a, drawn in zip(raw[0], tiny_case()[0], strict=True)
+        ]
     if case == "classic":
         options = dataclasses.replace(HULL, imaging=ImagingOptions(segmenter="classic"))
     result = Engine(options=options, threads=1).reconstruct(angiograms, grid)
