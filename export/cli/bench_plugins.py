@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from gcar_deploy.bench.tradeoff import BenchCase
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.metrics import VOLUME_THRESHOLD, skeleton
 from gcar_deploy.types import Volume
-from gcar_export.methods.rtk_timing import pair_carms, projection_pair
+from gcar_export.methods.rtk_timing import pair_carms, pair_clock
 from gcar_export.scenes.labels import read_label
 from gcar_export.scenes.protocols import Case, make_case
 
@@ -61,14 +60,4 @@ def pair_timer(volume: Volume, grid: Grid) -> Callable[[], float]:
     if min(low) >= 0:
         small[tuple(slice(a, a + n) for a, n in zip(low, volume.shape, strict=True))] = volume
     cube = Grid(center_mm=(0, 0, 0), size_mm=(180.0,) * 3, shape=(side,) * 3)
-    forward, back = projection_pair(small, cube, pair_carms())
-    forward()
-    back()
-
-    def seconds() -> float:
-        start = time.perf_counter()
-        forward()
-        back()
-        return time.perf_counter() - start
-
-    return seconds
+    return pair_clock(small, cube, pair_carms())

@@ -86,6 +86,20 @@ def pair_carms() -> list[CArm]:
     return case_geometry("paper", 2)[0]
 
 
+def pair_clock(volume: Volume, grid: Grid, carms: Sequence[CArm]) -> Callable[[], float]:
+    """Return what runs one forward + back projection and says how long it took, s; warmed up."""
+    forward, back = projection_pair(volume, grid, carms)
+
+    def seconds() -> float:
+        start = time.perf_counter()
+        forward()
+        back()
+        return time.perf_counter() - start
+
+    seconds()
+    return seconds
+
+
 def projection_pair(
     volume: Volume, grid: Grid, carms: Sequence[CArm]
 ) -> tuple[Callable[[], None], Callable[[], None]]:

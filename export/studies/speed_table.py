@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import statistics
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from gcar_deploy.measure.metrics import chamfer_mm, skeleton, volume_dice
 from gcar_deploy.types import Volume
 from gcar_export.evaluate.plots import MARKERS, figure
 from gcar_export.methods.nerp import NerpOptions
-from gcar_export.methods.rtk_timing import projection_pair
+from gcar_export.methods.rtk_timing import pair_clock
 from gcar_export.methods.settings import MethodSettings
 from gcar_export.methods.solve import Solved, solve
 from gcar_export.scenes.protocols import Case
@@ -112,7 +111,7 @@ def rows(
     times: dict[str, list[tuple[float, Solved]]] = {name: [] for name in asked}
     errors: dict[str, list[tuple[float, float | None]]] = {name: [] for name in asked}
     for case in cases:
-        pair = _pair(case)
+        pair = pair_clock(case.truth, case.grid, case.scene_carms)
         for round_ in range(rounds):
             for name, one in asked.items():
                 solved = solver(case, one.method, one.options)
@@ -175,20 +174,6 @@ def picture(made: Sequence[Row]) -> Figure:
 def values(made: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows as plain values."""
     return [dataclasses.asdict(row) for row in made]
-
-
-def _pair(case: Case) -> Callable[[], float]:
-    forward, back = projection_pair(case.truth, case.grid, case.scene_carms)
-    forward()
-    back()
-
-    def seconds() -> float:
-        start = time.perf_counter()
-        forward()
-        back()
-        return time.perf_counter() - start
-
-    return seconds
 
 
 def _errors(case: Case, volume: Volume | None) -> tuple[float, float | None]:
