@@ -22,7 +22,7 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
     Parameters
     ----------
     found : VesselImage of ``angiogram``
-    angiogram : Angiogram with ``erased`` and ``painted``
+    angiogram : Angiogram with ``erased``, ``painted``, or both
 
     Raises
     ------
@@ -30,9 +30,11 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
         Nothing is left.
     """
     erased, painted = angiogram.erased, angiogram.painted
-    if erased is None or painted is None:
+    if erased is None and painted is None:
         return found
-    painted = painted & found.valid
+    nowhere = np.zeros(found.mask.shape, bool)
+    erased = nowhere if erased is None else erased
+    painted = nowhere if painted is None else painted & found.valid
     mask = (found.mask & ~erased) | painted
     line, path = found.skeleton & ~erased, np.where(erased, np.float32(0), found.path_mm)
     if painted.any():
