@@ -5,7 +5,8 @@
 ``DIR`` holds ``xca_masks`` (``N.png`` with ``N_gt.png``; at its top or under ``data/``) and
 ``cases`` (``R_*``: raw pictures; ``C_*``: the same views as noise-free path lengths). ``--model``
 once per fold of a cross-validation scores each expert-masked picture by the model that left it
-out. A third table is of generated pictures, trivial to hard, a fourth of forty with a catheter.
+out. A third table is of generated pictures, trivial to hard, a fourth of forty with a catheter,
+the last of seconds per picture beside one itk-rtk pair.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.types import Image, Mask
 from gcar_export.scenes.expert_pictures import fold_edges
 from gcar_export.scenes.sanity_pictures import EACH, sanity_picture
+from gcar_export.studies import segmentation_time
 from gcar_export.studies.segmentation_page import write_page
 
 #: truth of the R_ cases: rays that cross at least this much vessel
@@ -48,7 +50,7 @@ CLAIMED = (0.7, 1.0, 1.4)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print both tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--each", action="store_true", help="one line per expert-masked picture")
@@ -78,6 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _print_cases(find(chosen.data, "cases"), nets[0], asked.who)
         _print_generated(nets[0], asked.who)
         _print_catheters(nets[0], asked.who)
+        print("\nTime of one picture (median, in turns)")
+        print(
+            segmentation_time.table(segmentation_time.timed(nets[0], segmentation_time.rtk_pair()))
+        )
     return 0
 
 
