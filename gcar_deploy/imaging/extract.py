@@ -91,7 +91,7 @@ def _found(
     if angiogram.intensity.kind == "mask":
         return _from_mask(angiogram)
     if angiogram.mask is not None:
-        return _from_grey(angiogram, _grey_values(angiogram), None)
+        return _from_grey(angiogram, _under(_grey_values(angiogram), "display"), None)
     if options.segmenter == "net":
         segmenter = _needed(segmenter)
     # A gradient along one side has equal rows, as a border has: the whole picture is asked first.
@@ -101,7 +101,13 @@ def _found(
         drawn = even_ground.shadow(grey[0]["linear"], grey[1])
         if drawn is not None:
             return put_back(_from_shadow(part, grey, drawn), angiogram, box)
-    return put_back(_seen(part, grey, options, segmenter), angiogram, box)
+    # Beside anatomy, widths and chords tell the laws apart too badly to choose one.
+    return put_back(_seen(part, _under(grey, "display"), options, segmenter), angiogram, box)
+
+
+def _under(grey: _Grey, *laws: str) -> _Grey:
+    """Keep the pictures under these laws alone, and the one to look for vessels in."""
+    return {name: p for name, p in grey[0].items() if name in ("search", *laws)}, grey[1]
 
 
 def _seen(
@@ -137,7 +143,7 @@ def _from_both(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter) -> Vesse
     except RefusedError:
         return _from_grey(angiogram, grey, None)
     try:
-        return fused(_from_grey(angiogram, grey, None), learned)
+        return fused(_from_grey(angiogram, grey, None), learned, grey[0]["display"])
     except RefusedError:
         return learned
 
@@ -145,8 +151,8 @@ def _from_both(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter) -> Vesse
 def _from_shadow(angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow) -> VesselImage:
     """Vessels on an even ground, without what the ridge filter takes for a catheter."""
     seen = dataclasses.replace(angiogram, mask=drawn.mask)
-    if drawn.shaded and "log" in grey[0]:  # half of the light is half of the contrast
-        grey = {name: grey[0][name] for name in ("search", "log")}, grey[1]
+    shaded = drawn.shaded and "log" in grey[0]  # half of the light is half of the contrast
+    grey = _under(grey, *(("log",) if shaded else ("linear", "log")))
     if drawn.flat:
         view = _from_drawn(seen, drawn.mask, EVEN_LENGTH_MM)
     else:
@@ -350,19 +356,22 @@ def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Imag
     -------
     pictures : name -> (rows, cols) float32
         ``search`` (where given) is the one to look for vessels in; the others are linear in
-        the path if their law holds.
+        the path if their law holds: ``linear`` (logarithm taken), ``log`` (Beer's law), and
+        ``display``, a compromise that is nowhere far off.
     holes : (rows, cols) bool, collimator
     """
     white = max(float(np.percentile(pixels, 99.5)), 1e-12)
     level = pixels / np.float32(white)
     if kind == "attenuation":
-        return {"linear": -level if dark else level}, np.zeros(pixels.shape, bool)
+        level = -level if dark else level
+        return {"linear": level, "display": level}, np.zeros(pixels.shape, bool)
     holes = enhance.collimator(pixels)
     if not dark:  # a negative: turn it back, so that Beer's law can be tried on it
         level = float(level.max()) - level
     floor = np.float32(0.5 / white)  # half a count: black stays finite
     return {
         "search": enhance.absorbance(level),
+        "display": -np.log(np.clip(level, 0, None) + np.float32(enhance.DISPLAY_OFFSET)),
         "linear": -level,
         "log": -np.log(np.maximum(level, floor)),
     }, holes

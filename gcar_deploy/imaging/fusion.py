@@ -9,41 +9,42 @@ import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.types import Mask
+from gcar_deploy.imaging.contrast import scaled_contrast
+from gcar_deploy.types import Image, Mask
 
 #: a line of the network's is on a device that lies so near, pixels each way
 _NEAR = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
 
 
-def fused(classic: VesselImage, learned: VesselImage) -> VesselImage:
-    """Return the mean of both paths, and the mask that the network draws without catheters.
+def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselImage:
+    """Read paths wherever either sees a vessel; the mask is what the network draws.
 
-    Their errors have little in common: the one follows any line, however faint, and its contrast
-    holds all that lies there; the other knows what a vessel looks like, at whatever size. The
-    classical paths are first brought to the scale of the network's, which is the better known.
-    A catheter has the contrast of a vessel, so that either method takes many for one: what one of
-    them knows for a catheter leaves both.
+    Their errors have little in common: the one follows any line, however faint; the other knows
+    what a vessel looks like, at whatever size. Contrast is the same for both, on the scale of the
+    network's paths. A catheter has the contrast of a vessel, so that either method takes many for
+    one: what one of them knows for a catheter leaves both.
 
     Parameters
     ----------
     classic, learned : of the same picture
+    picture : (rows, cols) float32, that picture about linear in the path, vessels bright
 
     Returns
     -------
     VesselImage ; its ``others`` are ``learned`` and ``classic``
     """
     classic, learned = _without(classic, learned.catheter), _without(learned, classic.catheter)
-    ours, theirs = classic.path_mm.astype(np.float64), learned.path_mm.astype(np.float64)
-    both = (ours > 0) & (theirs > 0)
-    power = float((ours[both] ** 2).sum())
-    scale = float((ours[both] * theirs[both]).sum()) / power if power > 0 else 1.0
+    either = (classic.path_mm > 0) | (learned.path_mm > 0)
     return dataclasses.replace(
         learned,
-        path_mm=(0.5 * (scale * ours + theirs)).astype(np.float32),
+        path_mm=scaled_contrast(
+            picture, ~learned.valid, either, np.where(learned.mask, learned.path_mm, 0),
+            learned.carm.pixel_at_isocenter_mm,
+        ),
         others=(learned, classic),
         catheter=_either(classic, learned, learned.mask),
         catheter_mm=max(classic.catheter_mm, learned.catheter_mm),
-    )
+    )  # fmt: skip
 
 
 def _without(view: VesselImage, device: Mask | None) -> VesselImage:

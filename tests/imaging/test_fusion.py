@@ -1,5 +1,7 @@
 """What is drawn of two methods' answers: without what one of them knows for a catheter."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -24,6 +26,12 @@ def drawn(*lines, width=5):
     return out > 0
 
 
+def picture(*masks):
+    """Vessels of 2 mm on a sloping ground, in units of 0.1 per mm."""
+    ground = np.add.outer(np.linspace(0, 1, SIDE), np.zeros(SIDE))
+    return (ground + 0.2 * np.logical_or.reduce(masks)).astype(np.float32)
+
+
 def seen(mask, catheter=None):
     return VesselImage(
         view_id="1", carm=CARM, path_mm=2 * mask.astype(np.float32), path_error=0.2, mask=mask,
@@ -34,7 +42,11 @@ def seen(mask, catheter=None):
 def test_a_catheter_that_one_method_knows_leaves_mask_and_path():
     shaft = drawn(SHAFT)
     vessel = drawn(VESSEL)
-    both = fused(seen(vessel, shaft & ~vessel), seen(shaft | vessel, np.zeros_like(shaft)))
+    both = fused(
+        seen(vessel, shaft & ~vessel),
+        seen(shaft | vessel, np.zeros_like(shaft)),
+        picture(shaft, vessel),
+    )
     away = np.hypot(*(np.indices(shaft.shape) - np.array([50, 60])[:, None, None])) > 9
     assert not (both.mask & shaft & away).any() and not (both.path_mm[shaft & away] > 0).any()
     assert (both.mask & vessel)[away].sum() == (vessel & away).sum()
@@ -45,7 +57,10 @@ def test_a_catheter_that_one_method_knows_leaves_mask_and_path():
 
 def test_a_catheter_that_the_network_knows_leaves_the_classical_path():
     shaft, vessel = drawn(SHAFT), drawn(VESSEL)
-    both = fused(seen(shaft | vessel, np.zeros_like(shaft)), seen(vessel, shaft & ~vessel))
+    both = fused(
+        seen(shaft | vessel, np.zeros_like(shaft)), seen(vessel, shaft & ~vessel),
+        picture(shaft, vessel),
+    )  # fmt: skip
     away = np.hypot(*(np.indices(shaft.shape) - np.array([50, 60])[:, None, None])) > 9
     assert (
         not (both.path_mm[shaft & away] > 0).any()
@@ -54,15 +69,29 @@ def test_a_catheter_that_the_network_knows_leaves_the_classical_path():
     assert (both.path_mm[vessel & away] > 0).all()
 
 
-def test_without_a_catheter_both_paths_are_averaged():
-    vessel = drawn(VESSEL)
+def test_paths_are_read_from_contrast_wherever_either_sees_a_vessel():
+    vessel, branch = drawn(VESSEL), drawn(SHAFT)
     none = np.zeros_like(vessel)
-    both = fused(seen(vessel, none), seen(drawn(SHAFT) | vessel, none))
-    assert both.mask.sum() == (drawn(SHAFT) | vessel).sum()
-    assert both.path_mm[100, 60] == pytest.approx(2) and both.path_mm[20, 30] == pytest.approx(1)
+    both = fused(seen(branch, none), seen(vessel, none), picture(branch, vessel))
+    assert both.mask.sum() == vessel.sum() and not both.path_mm[~(vessel | branch)].any()
+    # The network knows nothing of the branch: its contrast is that of the vessel.
+    assert both.path_mm[100, 60] == pytest.approx(2, rel=0.1)
+    assert both.path_mm[20, 30] == pytest.approx(2, rel=0.1)
+    # ... and says how deep, not the classical method's paths.
+    deep = dataclasses.replace(seen(branch, none), path_mm=9 * branch.astype(np.float32))
+    same = fused(deep, seen(vessel, none), picture(branch, vessel))
+    np.testing.assert_array_equal(same.path_mm, both.path_mm)
+
+
+def test_a_branch_of_half_the_contrast_is_half_as_deep():
+    vessel, branch = drawn(VESSEL), drawn(SHAFT) & ~drawn(VESSEL)
+    none = np.zeros_like(vessel)
+    faint = (picture(vessel) + 0.1 * branch).astype(np.float32)
+    both = fused(seen(vessel | branch, none), seen(vessel, none), faint)
+    assert both.path_mm[20, 30] == pytest.approx(1, rel=0.15)
 
 
 def test_a_mask_is_never_emptied():
     vessel = drawn(VESSEL)
-    both = fused(seen(drawn(SHAFT), vessel), seen(vessel, np.zeros_like(vessel)))
+    both = fused(seen(drawn(SHAFT), vessel), seen(vessel, np.zeros_like(vessel)), picture(vessel))
     assert both.mask.sum() == vessel.sum()
