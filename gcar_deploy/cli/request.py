@@ -62,7 +62,7 @@ OPTIONS: Mapping[str, _Option] = {
     ),
     "segmenter": _choice(
         "segmenter", SEGMENTERS, _USUAL.imaging.segmenter,
-        "Who finds vessels in raw pictures; auto takes the mean of both.",
+        "Who finds vessels in raw pictures; auto takes both.",
     ),
     "pose": _choice(
         "pose", POSES, "auto", "Whether shift and turn between the runs are estimated."

@@ -48,8 +48,8 @@ class ImagingOptions:
     """From a picture to vessel mask, skeleton and path length."""
 
     limits: PictureLimits = dataclasses.field(default_factory=PictureLimits)
-    #: who finds vessels in grey values: the ridge filter, the network, or both (their mean, or the
-    #: network alone where the views then agree better)
+    #: who finds vessels in grey values: the ridge filter, the network, or both (what either
+    #: sees, or one alone where the views then agree better)
     segmenter: SegmenterName = "auto"
     #: take a picture of another size than its geometry's for a rescaled one: a crop of the same
     #: shape looks alike, and gives a tree of the wrong size
