@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from gcar_deploy.config import SEGMENTERS, ImagingOptions
+from gcar_deploy.config import SEGMENTERS, ImagingOptions, SegmenterName
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import extract_vessels
@@ -61,10 +61,11 @@ def timed(
     net: Segmenter | None, pair: Callable[[], None] | None, trees: int = 3, repeats: int = 3
 ) -> dict[str, float]:
     """Median seconds by method, and of the pair; all in turns, after one untimed round."""
-    asked: dict[str, Callable[[Angiogram], object]] = {
-        who: lambda picture, who=who: extract_vessels(picture, ImagingOptions(segmenter=who), net)
-        for who in SEGMENTERS
-    }
+
+    def asking(who: SegmenterName) -> Callable[[Angiogram], object]:
+        return lambda picture: extract_vessels(picture, ImagingOptions(segmenter=who), net)
+
+    asked = {str(who): asking(who) for who in SEGMENTERS}
     if pair is not None:
         asked[PAIR] = lambda _: pair()
     seconds: dict[str, list[float]] = {name: [] for name in asked}
