@@ -167,7 +167,7 @@ def objective(
     c2 = options.robust_sigmas**2
     for target, seen in zip(targets, prints, strict=True):
         # Pixels without a tube cost what they cost an empty model.
-        pixel = seen.pixel[seen.first]
+        pixel = seen.covered
         path = target.path_mm.reshape(-1)[pixel]
         sigma = target.sigma_mm.reshape(-1)[pixel]
         z2 = ((path - target.contrast * seen.totals()) / sigma) ** 2
@@ -194,8 +194,9 @@ def normal_equations(
             continue
         w, e = weights_of(target, seen, options)
         # Each crossing counts as often as there are: the bound of the couplings left out.
-        moments = moments_of(seen, w * seen.crossings * target.contrast**2, count)
-        pulls = _pulls(seen, w * e * target.contrast, count)
+        basis = basis_of(seen)
+        moments = moments_of(seen, basis, w * seen.crossings * target.contrast**2)
+        pulls = sums_of(seen, basis * (w * e * target.contrast)).T
         M = to_unknowns(tubes, target.carm)
         blocks += M @ moments @ np.swapaxes(M, 1, 2)
         pull += (M @ pulls[:, :, None])[:, :, 0]
@@ -206,40 +207,42 @@ def normal_equations(
 
 def weights_of(target: Target, seen: Footprint, options: TubeOptions) -> tuple[Scalars, Scalars]:
     """(e,) weight of each entry's pixel, 1 / mm^2, and (e,) what the model leaves of its path."""
-    path = target.path_mm.reshape(-1)[seen.pixel[seen.first]]
-    left = (path - target.contrast * seen.totals())[seen.group]
-    sigma = target.sigma_mm.reshape(-1)[seen.pixel]
+    path, sigma, weight = (
+        picture.reshape(-1)[seen.covered]
+        for picture in (target.path_mm, target.sigma_mm, target.weight)
+    )
+    left = path - target.contrast * seen.totals()
     robust = 1.0 / (1.0 + (left / (options.robust_sigmas * sigma)) ** 2)
-    weight = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
-    return weight, left
+    weight = weight * robust * (target.pixel_mm / sigma) ** 2
+    return weight[seen.group], left[seen.group]
 
 
-def basis_of(seen: Footprint) -> tuple[Scalars, ...]:
-    """Six derivatives of an entry's path: by both ends' pixels (col, row) and log radii."""
-    # The distance shrinks when the axis moves towards the pixel.
-    x = -seen.d_distance * seen.normal[:, 0]
-    y = -seen.d_distance * seen.normal[:, 1]
-    r, t = seen.d_log_radius, seen.t
-    s = 1 - t
-    return x * s, y * s, x * t, y * t, r * s, r * t
+def basis_of(seen: Footprint) -> Array:
+    """(6, e) derivatives of an entry's path: by both ends' pixels (col, row) and log radii."""
+    both = np.concatenate([seen.d_axis, seen.d_log_radius[None]])
+    second = both * seen.t
+    first = both - second
+    return np.concatenate([first[:2], second[:2], first[2:], second[2:]])
 
 
-def moments_of(seen: Footprint, weight: Scalars, count: int) -> Array:
+def moments_of(seen: Footprint, basis: Array, weight: Scalars) -> Array:
     """(s, 6, 6) weighted sums of products of the derivatives over each segment's entries."""
-    basis = basis_of(seen)
-    out = np.empty((count, 6, 6))
+    count = seen.pairing.count
+    out = np.empty((6, 6, len(count)))
     for a in range(6):
-        scaled = weight * basis[a]
-        for b in range(a, 6):
-            out[:, a, b] = np.bincount(seen.segment, scaled * basis[b], minlength=count)
-            out[:, b, a] = out[:, a, b]
+        out[a, a:] = sums_of(seen, basis[a:] * (weight * basis[a]))
+        out[a:, a] = out[a, a:]
+    return np.moveaxis(out, -1, 0)
+
+
+def sums_of(seen: Footprint, values: Array) -> Array:
+    """(k, s) sums of (k, e) values over each segment's entries."""
+    count = seen.pairing.count
+    out = np.zeros((len(values), len(count)))
+    some = np.flatnonzero(count)
+    if len(some):
+        out[:, some] = np.add.reduceat(values, (np.cumsum(count) - count)[some], axis=1)
     return out
-
-
-def _pulls(seen: Footprint, weight: Scalars, count: int) -> Array:
-    """(s, 6) weighted sums of the derivatives over each segment's entries."""
-    sums = [np.bincount(seen.segment, weight * d, minlength=count) for d in basis_of(seen)]
-    return np.stack(sums, axis=1)
 
 
 def to_unknowns(tubes: Tubes, carm: CArm) -> Array:

@@ -18,7 +18,7 @@ from scipy import sparse
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.tubes.gauss_newton import basis_of, moments_of, weights_of
+from gcar_deploy.tubes.gauss_newton import basis_of, moments_of, sums_of, weights_of
 from gcar_deploy.tubes.model import Footprint, Tubes
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Array, Pixels, Scalars
@@ -79,9 +79,10 @@ def seen_by(tubes: Tubes, target: Target, seen: Footprint, options: TubeOptions)
     columns = np.stack([2 * a, 2 * a + 1, 2 * b, 2 * b + 1, 2 * n + a, 2 * n + b], axis=1)
     weight, left = weights_of(target, seen, options)
     weight = weight * target.contrast**2 / misfit(tubes, target, seen, left)
-    one, other, crossed = _crossed(seen, weight, segments)
+    basis = basis_of(seen)
+    one, other, crossed = _crossed(seen, basis, weight, segments)
     parts = (
-        (columns, columns, moments_of(seen, weight, segments)),
+        (columns, columns, moments_of(seen, basis, weight)),
         (columns[one], columns[other], crossed),
         (columns[other], columns[one], np.swapaxes(crossed, 1, 2)),
     )
@@ -104,13 +105,15 @@ def misfit(tubes: Tubes, target: Target, seen: Footprint, left: Scalars) -> Scal
     ----------
     left : (e,) what the model leaves of each entry's path, mm
     """
-    count = len(tubes.first)
     z2 = (left / target.sigma_mm.reshape(-1)[seen.pixel]) ** 2
-    total = _along(np.bincount(seen.segment, z2, count).astype(np.float64), tubes.branch)
-    pixels = _along(np.bincount(seen.segment, minlength=count).astype(np.float64), tubes.branch)
-    local = (total / np.maximum(pixels, 1.0) + LEAST_MISFIT)[seen.segment]
-    if len(local):
-        local = np.maximum.reduceat(local, seen.first)[seen.group]
+    told = seen.path_mm > 0
+    total, pixels = (
+        _along(sums, tubes.branch) for sums in sums_of(seen, np.stack([z2 * told, told]))
+    )
+    local = np.where(told, (total / np.maximum(pixels, 1.0) + LEAST_MISFIT)[seen.segment], 0.0)
+    most = np.full(len(seen.covered), LEAST_MISFIT)
+    np.maximum.at(most, seen.group, local)
+    local = most[seen.group]
     out: Scalars = PATCH_MM2 * local * np.where(seen.crossings > 1, CROSSED, 1.0)
     return out
 
@@ -137,27 +140,32 @@ def _by_unknowns(tubes: Tubes, carm: CArm) -> sparse.csr_matrix:
     )
 
 
-def _crossed(seen: Footprint, weight: Scalars, count: int) -> tuple[Array, Array, Array]:
+def _crossed(
+    seen: Footprint, basis: Array, weight: Scalars, count: int
+) -> tuple[Array, Array, Array]:
     """Pairs of segments that share pixels, (k,) and (k,), and (k, 6, 6) their moments."""
     one, other = _pairs(seen)
     key = seen.segment[one] * count + seen.segment[other]
-    pairs, place = np.unique(key, return_inverse=True)
-    basis = basis_of(seen)
-    out = np.empty((len(pairs), 6, 6))
-    for a in range(6):
-        scaled = weight[one] * basis[a][one]
-        for b in range(6):
-            out[:, a, b] = np.bincount(place, scaled * basis[b][other], minlength=len(pairs))
-    return pairs // count, pairs % count, out
+    order = np.argsort(key, kind="stable")
+    one, other, key = one[order], other[order], key[order]
+    start = np.flatnonzero(np.diff(key, prepend=-1))
+    if not len(start):
+        return start, start, np.zeros((0, 6, 6))
+    second = basis[:, other]
+    out = np.stack(
+        [np.add.reduceat(second * (weight[one] * first), start, axis=1) for first in basis[:, one]]
+    )
+    return key[start] // count, key[start] % count, np.moveaxis(out, -1, 0)
 
 
 def _pairs(seen: Footprint) -> tuple[Array, Array]:
-    """Every two entries that share a pixel, each pair once."""
-    entry = np.arange(len(seen.pixel))
-    rank = entry - seen.first[seen.group]
+    """Every two entries above 0 that share a pixel, each pair once."""
+    entry = np.flatnonzero((seen.crossings > 1) & (seen.path_mm > 0))
+    entry = entry[np.argsort(seen.group[entry], kind="stable")]
+    group = seen.group[entry]
     one, other = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for step in range(1, int(rank.max(initial=0)) + 1):
-        later = entry[rank >= step]
-        one.append(later - step)
-        other.append(later)
+    for step in range(1, int(seen.crossings.max(initial=1))):
+        same = group[step:] == group[:-step]
+        one.append(entry[:-step][same])
+        other.append(entry[step:][same])
     return np.concatenate(one), np.concatenate(other)

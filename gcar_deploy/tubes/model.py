@@ -18,7 +18,7 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes.pairing import Pairing, nearest_of_runs, paired
+from gcar_deploy.tubes.pairing import Pairing, paired
 from gcar_deploy.types import Array, Points, Scalars
 
 #: a tube seen this much end-on is treated as if at this sine of the angle to the ray.
@@ -87,41 +87,54 @@ def tubes_of(tree: Tree) -> Tubes:
 class Footprint:
     """Where tubes fall in one picture: one entry per pixel and crossing.
 
+    Entries are sorted by segment; those beyond the reach of their tube are 0.
+
     Attributes
     ----------
-    pixel : (e,) flat pixel index
-    segment : (e,) segment
     t : (e,) 0 .. 1, where along the segment
     path_mm : (e,) contribution, the union factor included
-    d_distance : (e,) derivative by distance from the axis, mm per px
+    d_axis : (2, e) derivative by the place of the axis, (col, row), mm per px
     d_log_radius : (e,) derivative by log radius, mm
-    normal : (e, 2) unit vector (col, row) from the axis to the pixel
-    crossings : (e,) number of entries that share the pixel
-    first : (g,) first entry of each pixel; entries are sorted by pixel
-    group : (e,) number of the entry's pixel among those of ``first``
+    crossings : (e,) number of entries above 0 that share the pixel
     pairing : Pairing it was made with
     """
 
-    pixel: Array
-    segment: Array
     t: Scalars
     path_mm: Scalars
-    d_distance: Scalars
+    d_axis: Array
     d_log_radius: Scalars
-    normal: Array
     crossings: Array
-    first: Array
-    group: Array
     pairing: Pairing
 
+    @property
+    def pixel(self) -> Array:
+        """(e,) flat pixel index."""
+        return self.pairing.pixel
+
+    @property
+    def segment(self) -> Array:
+        """(e,) segment."""
+        return self.pairing.segment
+
+    @property
+    def covered(self) -> Array:
+        """(g,) the distinct pixels, sorted."""
+        return self.pairing.covered
+
+    @property
+    def group(self) -> Array:
+        """(e,) which of ``covered`` an entry's pixel is."""
+        return self.pairing.group
+
     def totals(self) -> Scalars:
-        """(g,) path length of each pixel that a tube covers, mm; pixel[first] says which."""
-        total: Array = np.bincount(self.group, self.path_mm, minlength=len(self.first))
+        """(g,) path length of each of the pixels ``covered``, mm."""
+        total: Array = np.bincount(self.group, self.path_mm, minlength=len(self.covered))
         return total
 
     def image(self, shape: tuple[int, int]) -> Array:
         """(rows, cols) float64 path length, mm."""
-        image: Array = np.bincount(self.pixel, self.path_mm, minlength=shape[0] * shape[1])
+        image = np.zeros(shape[0] * shape[1])
+        image[self.covered] = self.totals()
         return image.reshape(shape)
 
 
@@ -141,73 +154,44 @@ def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None =
     pixels, depth = carm.project(tubes.points_mm)
     per_mm = np.sqrt(np.prod(carm.focal_px)) / np.maximum(depth, 1.0)
     reach = tubes.radius_mm * per_mm + 0.5 * box_px
+    i, j = tubes.first, tubes.second
     if pairing is None or not pairing.fits(pixels, reach):
-        a, b = pixels[tubes.first], pixels[tubes.second]
-        ahead = (depth[tubes.first] > 1.0) & (depth[tubes.second] > 1.0)
-        wide = np.maximum(reach[tubes.first], reach[tubes.second])
-        pairing = paired((a, b), wide, ahead, tubes.branch, (carm.rows, carm.columns))
-        pairing = dataclasses.replace(pairing, corner=pixels, reach=reach)
-    # The nearest of each run in single precision; what is kept is worked out in double.
-    start = pixels.astype(np.float32)[tubes.first]
-    along = (pixels[tubes.second] - pixels[tubes.first]).astype(np.float32)
-    unit = along / np.maximum(np.einsum("ij,ij->i", along, along), np.float32(1e-12))[:, None]
-    table = np.ascontiguousarray(np.concatenate([start, along, unit], axis=1).T)
-    x0, y0, dx, dy, ux, uy = (column[pairing.segment] for column in table)
-    x, y = pairing.col - x0, pairing.row - y0
-    t = np.clip(x * ux + y * uy, 0.0, 1.0)
-    keep = nearest_of_runs(pairing, (x - t * dx) ** 2 + (y - t * dy) ** 2)
-    return _crossed(tubes, pairing, keep, (pixels, depth, per_mm, reach), box_px)
-
-
-def _crossed(
-    tubes: Tubes,
-    pairing: Pairing,
-    keep: Array,
-    projected: tuple[Array, Scalars, Scalars, Scalars],
-    box_px: float,
-) -> Footprint:
-    pixels, depth, per_mm, reach = projected
-    pixel, segment = pairing.pixel[keep], pairing.segment[keep]
-    i, j = tubes.first[segment], tubes.second[segment]
-    a, b = pixels[tubes.first], pixels[tubes.second]
-    step = b - a
-    inverse = 1.0 / np.maximum(np.einsum("ij,ij->i", step, step), 1e-12)
-    x, y = pairing.col[keep] - a[segment, 0], pairing.row[keep] - a[segment, 1]
-    dx, dy = step[segment, 0], step[segment, 1]
-    t = np.clip((x * dx + y * dy) * inverse[segment], 0.0, 1.0)
-    x -= t * dx
-    y -= t * dy
-    distance = np.sqrt(x * x + y * y)
-    near = distance < reach[i] + t * (reach[j] - reach[i])
-    pixel, segment, i, j, t, x, y, distance = (
-        value[near] for value in (pixel, segment, i, j, t, x, y, distance)
-    )
-    scale = per_mm[i] + t * (per_mm[j] - per_mm[i])
-    radius = np.exp(tubes.log_radius[i] + t * (tubes.log_radius[j] - tubes.log_radius[i])) * scale
-    length, d_distance, d_radius = box_chord(distance, radius, box_px)
+        segments = i, j, tubes.branch
+        pairing = paired(pixels, reach, depth > 1.0, segments, (carm.rows, carm.columns))
     begins, finishes = _is_end(tubes, -1), _is_end(tubes, 1)
     stretch = _inverse_sine(tubes.points_mm, pixels, per_mm, begins, finishes)
-    beyond = ((t <= 0) & begins[i]) | ((t >= 1) & finishes[j])
-    to_mm = np.where(beyond, 1.0, stretch[i] + t * (stretch[j] - stretch[i])) / scale
+    step = pixels[j] - pixels[i]
+    inverse = 1.0 / np.maximum(np.einsum("ij,ij->i", step, step), 1e-12)
+    # What is linear along a segment, at its first point and the change to its second.
+    linear = np.stack([tubes.log_radius, per_mm, stretch, depth])
+    # Beyond the ends of a branch caps are round: t there is at most 0, or at least 1.
+    caps = [np.where(begins[i], 0.0, -1.0), np.where(finishes[j], 1.0, 2.0)]
+    table = [*pixels[i].T, *step.T, inverse, *caps, *linear[:, i], *(linear[:, j] - linear[:, i])]
+    x, y, dx, dy, inverse, low, high, *values = np.repeat(np.stack(table), pairing.count, axis=1)
+    log_radius, scale, stretch, middle = values[:4]
+    x, y = pairing.col - x, pairing.row - y
+    t = np.minimum(np.maximum((x * dx + y * dy) * inverse, 0.0), 1.0)
+    x -= t * dx
+    y -= t * dy
+    for value, change in zip(values[:4], values[4:], strict=True):
+        value += t * change
+    distance = np.sqrt(x * x + y * y)
+    radius = np.exp(log_radius) * scale
+    length, d_distance, d_radius = box_chord(distance, radius, box_px)
+    to_mm = np.where((t <= low) | (t >= high), 1.0, stretch) / scale
     path = length * to_mm
-    middle = depth[i] + t * (depth[j] - depth[i])
-    first = np.flatnonzero(np.concatenate([[True], pixel[1:] != pixel[:-1]])[: len(pixel)])
-    crossings = np.diff(np.append(first, len(pixel)))
-    group = np.repeat(np.arange(len(first)), crossings)
-    factor = _union_factor(first, crossings, middle, path)
-    path = path * factor
-    to_mm = to_mm * factor
+    crossings = np.bincount(pairing.group, path > 0, minlength=len(pairing.covered))
+    factor = _union_factor(pairing, middle, path)
+    path *= factor
+    to_mm *= factor
+    # The distance shrinks when the axis moves towards the pixel.
+    towards = d_distance * to_mm / -np.maximum(distance, 1e-9)
     return Footprint(
-        pixel=pixel,
-        segment=segment,
         t=t,
         path_mm=path,
-        d_distance=d_distance * to_mm,
+        d_axis=np.stack([x * towards, y * towards]),
         d_log_radius=d_radius * radius * to_mm,
-        normal=np.stack([x, y], axis=1) / np.maximum(distance, 1e-9)[:, None],
-        crossings=crossings[group],
-        first=first,
-        group=group,
+        crossings=crossings[pairing.group],
         pairing=pairing,
     )
 
@@ -251,22 +235,20 @@ def _is_end(tubes: Tubes, side: int) -> Array:
     return out
 
 
-def _union_factor(first: Array, count: Array, middle: Scalars, path: Scalars) -> Scalars:
+def _union_factor(pairing: Pairing, middle: Scalars, path: Scalars) -> Scalars:
     """Per entry: (length of the union of a pixel's intervals) / (their sum)."""
     factor = np.ones(len(path))
-    at = first[count == 2]
-    one, two = path[at], path[at + 1]
+    a, b = pairing.double
+    one, two = path[a], path[b]
     both = one + two
     # Overlap of two intervals: what their halves reach beyond the distance of their middles.
-    shared = 0.5 * both - np.abs(middle[at + 1] - middle[at])
+    shared = 0.5 * both - np.abs(middle[b] - middle[a])
     shared = np.clip(shared, 0.0, np.minimum(one, two))
-    factor[at] = factor[at + 1] = (both - shared) / np.maximum(both, 1e-12)
-    more = count > 2
-    if more.any():
-        start, size = first[more], count[more]
-        entries = np.repeat(start - np.cumsum(size) + size, size) + np.arange(size.sum())
-        group = np.repeat(np.arange(len(size)), size)
-        factor[entries] = _union_share(group, middle[entries], path[entries])
+    factor[a] = factor[b] = (both - shared) / np.maximum(both, 1e-12)
+    more = pairing.several
+    if len(more):
+        group = np.cumsum(np.diff(pairing.group[more], prepend=-1) != 0) - 1
+        factor[more] = _union_share(group, middle[more], path[more])
     return factor
 
 

@@ -1,7 +1,7 @@
-"""Which pixels a tube may cover: segments paired with the pixels near them.
+"""Which pixels a tube may cover: each crossing of a branch by a ray with its nearest segment.
 
-Pairs are kept from step to step while the tubes move little, and grouped into runs (one crossing
-of one branch by one ray), of which the nearest segment counts.
+Kept from step to step while the tubes move little: neighbours move together, so that what is
+nearest stays so but for pixels that lie between two of them, where either says nearly the same.
 """
 
 from __future__ import annotations
@@ -25,73 +25,77 @@ RUN_GAP = 3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pairing:
-    """Pixels near each segment.
+    """Crossings: pixels within the margin of a branch's reach, with the nearest segment there.
 
     Attributes
     ----------
-    pixel, segment : (q,) flat pixel and segment, sorted by pixel, then segment
-    row, col : (q,) float32, of the pixel
-    run : (q,) number of the run each pair belongs to
-    first : (runs,) first pair of each run
-    corner, reach : (n, 2), (n,) projected points and reach (px) the pairs were made for
-    margin : float, px
+    pixel, segment : (e,) flat pixel and segment, sorted by segment, then pixel
+    row, col : (e,) of the pixel
+    count : (s,) crossings of each segment
+    covered : (g,) the distinct pixels, sorted
+    group : (e,) which of ``covered`` a crossing's pixel is
+    double : (2, k) crossings that share their pixel with one other
+    several : (m,) crossings that share theirs with more, sorted by pixel
+    corner, reach : (n, 2), (n,) projected points and reach (px) the crossings were found for
     """
 
     pixel: Array
     segment: Array
     row: Scalars
     col: Scalars
-    run: Array
-    first: Array
+    count: Array
+    covered: Array
+    group: Array
+    double: Array
+    several: Array
     corner: Array
     reach: Scalars
-    margin: float
 
     def fits(self, pixels: Array, reach: Scalars) -> bool:
         """Whether tubes at these pixels, with this reach, lie within the margin."""
         if len(pixels) != len(self.corner):
             return False
         move = np.abs(pixels - self.corner).max(axis=1) + np.maximum(reach - self.reach, 0.0)
-        return bool(move.max(initial=0.0) <= self.margin)
+        return bool(move.max(initial=0.0) <= MARGIN_PX)
 
 
 def paired(
-    ends: tuple[Array, Array],
+    pixels: Array,
     reach: Scalars,
     ahead: Array,
-    branch: Array,
+    segments: tuple[Array, Array, Array],
     shape: tuple[int, int],
 ) -> Pairing:
-    """Pair segments with pixels.
+    """Pair pixels with segments.
 
     Parameters
     ----------
-    ends : (s, 2) first and (s, 2) second ends of the segments, (col, row)
-    reach : (s,) pixels
-    ahead : (s,) bool, whether the segment lies in front of the source
-    branch : (s,) branch of each segment, in order
+    pixels : (n, 2) projected points, (col, row)
+    reach : (n,) pixels
+    ahead : (n,) bool, whether the point lies in front of the source
+    segments : (s,) first point, second point and branch of each segment, in order
     shape : rows, columns of the picture
-
-    Returns
-    -------
-    Pairing without ``corner`` and ``reach``, which are the caller's
     """
-    a, b = ends
-    wide = reach + MARGIN_PX
-    row, col, segment = _near_pixels(a, b, wide, ahead, branch, shape)
+    first, second, branch = segments
+    a, b = pixels[first], pixels[second]
+    wide = np.maximum(reach[first], reach[second]) + MARGIN_PX
+    row, col, segment = _near_pixels(a, b, wide, ahead[first] & ahead[second], branch, shape)
     along = b - a
     inverse = 1.0 / np.maximum(np.einsum("ij,ij->i", along, along), 1e-12)
+    # Single precision: of segments as near as that either will do.
     table = np.concatenate([a, along, inverse[:, None], (wide**2)[:, None]], axis=1)
-    x0, y0, dx, dy, inv, most = (c[segment] for c in np.ascontiguousarray(table.T, np.float32))
-    x, y = col - x0, row - y0
-    t = np.clip((x * dx + y * dy) * inv, np.float32(0), np.float32(1))
+    many = np.bincount(segment, minlength=len(first))
+    x, y, dx, dy, inv, most = np.repeat(table.T.astype(np.float32), many, axis=1)
+    np.subtract(col, x, out=x, dtype=np.float32)
+    np.subtract(row, y, out=y, dtype=np.float32)
+    t = np.minimum(np.maximum((x * dx + y * dy) * inv, np.float32(0)), np.float32(1))
     x -= t * dx
     y -= t * dy
     distance2 = x * x + y * y
     near = np.flatnonzero(distance2 < most)
-    near = near[_by_pixel(row[near], col[near])]
-    pixel, segment = row[near] * shape[1] + col[near], segment[near]
-    distance = np.sqrt(distance2[near])
+    pixel, segment, rank = _by_pixel(
+        row[near] * shape[1] + col[near], segment[near], distance2[near]
+    )
     new = np.ones(len(pixel), bool)
     own = branch[segment]
     # Short segments (seen end-on) leave wider gaps in between, of those whose foot lies elsewhere.
@@ -101,43 +105,61 @@ def paired(
         | (own[1:] != own[:-1])
         | (segment[1:] - segment[:-1] > gap[segment[1:]])
     )
-    run = np.cumsum(new) - 1
-    if len(run):
-        # Neighbours move together: one that lies further by the margin stays further.
-        best = np.minimum.reduceat(distance, np.flatnonzero(new))
-        close = distance <= best[run] + np.float32(MARGIN_PX)
-        pixel, segment, run = pixel[close], segment[close], run[close]
-    first = np.flatnonzero(np.concatenate([[True], run[1:] != run[:-1]])[: len(run)])
+    nearest = _nearest_of_runs(np.cumsum(new) - 1, rank)
+    pixel, segment = pixel[nearest], segment[nearest]
+    new = np.ones(len(pixel), bool)
+    new[1:] = pixel[1:] != pixel[:-1]
+    covered, group = pixel[new], np.cumsum(new) - 1
+    # From the order of pixels to that of segments.
+    order = np.argsort(segment.astype(np.uint16 if len(first) < 2**16 else int), kind="stable")
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    start = np.flatnonzero(new)
+    shared = np.diff(np.append(start, len(pixel)))
+    two = start[shared == 2]
+    pixel, segment = pixel[order], segment[order]
     down = pixel // shape[1]
     return Pairing(
         pixel=pixel,
         segment=segment,
-        row=down.astype(np.float32),
-        col=(pixel - down * shape[1]).astype(np.float32),
-        run=run,
-        first=first,
-        corner=np.zeros((0, 2)),
-        reach=np.zeros(0),
-        margin=MARGIN_PX,
+        row=down.astype(np.float64),
+        col=(pixel - down * shape[1]).astype(np.float64),
+        count=np.bincount(segment, minlength=len(first)),
+        covered=covered,
+        group=group[order],
+        double=np.stack([place[two], place[two + 1]]),
+        several=place[(shared > 2)[group]],
+        corner=pixels,
+        reach=reach,
     )
 
 
-def nearest_of_runs(pairing: Pairing, distance2: Scalars) -> Array:
-    """Keep one pair per pixel and run of neighbouring segments: the nearest, the first of ties."""
-    if not len(distance2):
-        return np.zeros(0, np.int64)
-    best = np.minimum.reduceat(distance2, pairing.first)
-    hit = np.flatnonzero(distance2 <= best[pairing.run])
-    run = pairing.run[hit]
-    new = np.ones(len(run), bool)
-    new[1:] = run[1:] != run[:-1]
+def _nearest_of_runs(run: Array, rank: Array) -> Array:
+    """(runs,) index of the nearest of each run, the first of ties; runs are numbered in order."""
+    if not len(run):
+        return run
+    best = np.full(run[-1] + 1, np.iinfo(np.int64).max)
+    np.minimum.at(best, run, rank)
+    hit = np.flatnonzero(rank == best[run])
+    new = np.ones(len(hit), bool)
+    new[1:] = run[hit[1:]] != run[hit[:-1]]
     return hit[new]
 
 
-def _by_pixel(row: Array, col: Array) -> Array:
-    """Order by row, then column, then as given; two radix sorts, since no picture is that wide."""
-    order = np.argsort(col.astype(np.uint16), kind="stable")
-    return order[np.argsort(row.astype(np.uint16)[order], kind="stable")]
+def _by_pixel(pixel: Array, segment: Array, distance2: Scalars) -> tuple[Array, Array, Array]:
+    """Sort by pixel, then segment; distances become whole numbers of the same order.
+
+    As digits of one number each, which sorts several times faster than an order is found.
+    """
+    of_segment = int(segment.max(initial=0)).bit_length()
+    of_rank = min(62 - of_segment - int(pixel.max(initial=0)).bit_length(), 31)
+    # Floats above 0 have the order of their bits.
+    rank = distance2.view(np.int32).astype(np.int64) >> (31 - of_rank)
+    key = (((pixel << of_segment) | segment) << of_rank) | rank
+    key.sort()
+    rank = key & ((1 << of_rank) - 1)
+    key >>= of_rank
+    return key >> of_segment, key & ((1 << of_segment) - 1), rank
 
 
 def _near_pixels(
@@ -182,7 +204,7 @@ def _beyond(unit: Array, wide: Scalars, branch: Array) -> tuple[Scalars, Scalars
     share[branch[1:] != branch[:-1]] = 1.0
     low = wide * np.concatenate([[1.0], share])[: len(wide)]
     high = wide * np.concatenate([share, [1.0]])[: len(wide)]
-    return np.minimum(low + MARGIN_PX, wide), np.minimum(high + MARGIN_PX, wide)
+    return low, high
 
 
 def _stretch(low: Scalars, high: Scalars, slope: Scalars) -> tuple[Scalars, Scalars]:

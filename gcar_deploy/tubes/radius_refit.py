@@ -19,7 +19,13 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from gcar_deploy.config import TubeOptions
-from gcar_deploy.tubes.gauss_newton import MAX_LOG_STEP, RADIUS_BOUNDS_MM, footprints
+from gcar_deploy.tubes.gauss_newton import (
+    MAX_LOG_STEP,
+    RADIUS_BOUNDS_MM,
+    footprints,
+    sums_of,
+    weights_of,
+)
 from gcar_deploy.tubes.model import Footprint, Tubes
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Scalars
@@ -97,16 +103,18 @@ def _pictures(
     n = len(tubes.log_radius)
     diagonal, beside, pull = np.zeros(n), np.zeros(n), np.zeros(n)
     for target, seen in zip(targets, prints, strict=True):
-        error = (target.path_mm.reshape(-1)[seen.pixel[seen.first]] - seen.totals())[seen.group]
-        sigma = target.sigma_mm.reshape(-1)[seen.pixel]
-        robust = 1.0 / (1.0 + (error / (options.robust_sigmas * sigma)) ** 2)
-        weight = target.weight.reshape(-1)[seen.pixel] * robust * (target.pixel_mm / sigma) ** 2
-        first, t, slope = tubes.first[seen.segment], seen.t, seen.d_log_radius
+        weight, error = weights_of(target, seen, options)
+        t, slope = seen.t, seen.d_log_radius
+        s = 1 - t
         # Crossings majorise the coupling of vessels that share a ray, as in ``tube.py``.
         curve = weight * seen.crossings * slope**2
-        diagonal += np.bincount(first, curve * (1 - t) ** 2, n)
-        diagonal += np.bincount(first + 1, curve * t**2, n)
-        beside += np.bincount(first, curve * t * (1 - t), n)
-        pull += np.bincount(first, weight * error * slope * (1 - t), n)
-        pull += np.bincount(first + 1, weight * error * slope * t, n)
+        force = weight * error * slope
+        of_first, of_second, of_both, *forces = sums_of(
+            seen, np.stack([curve * s * s, curve * t * t, curve * s * t, force * s, force * t])
+        )
+        diagonal[tubes.first] += of_first
+        diagonal[tubes.second] += of_second
+        beside[tubes.first] += of_both
+        pull[tubes.first] += forces[0]
+        pull[tubes.second] += forces[1]
     return diagonal, beside, pull

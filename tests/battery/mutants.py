@@ -238,7 +238,7 @@ MUTANTS = (
     Mutant(
         "sigma: vessels that share rays do not couple",
         "gcar_deploy/tubes/hessian.py",
-        "    for step in range(1, int(rank.max(initial=0)) + 1):",
+        "    for step in range(1, int(seen.crossings.max(initial=1))):",
         "    for step in range(1, 1):",
         ("tests/tubes/test_hessian.py",),
     ),
@@ -266,8 +266,8 @@ MUTANTS = (
     Mutant(
         "rays: a pixel belongs to the last vessel of its run, not the nearest",
         "gcar_deploy/tubes/pairing.py",
-        "best = np.minimum.reduceat(distance2, pairing.first)",
-        "best = np.maximum.reduceat(distance2, pairing.first)",
+        "np.minimum.at(best, run, rank)",
+        "best[run] = rank",
         (_MODEL,),
     ),
     Mutant(

@@ -81,9 +81,7 @@ def test_hessian_is_the_sum_over_entries():
             row = np.zeros(3 * p + n)
             for point, share in ((tubes.first[s], 1 - print_.t[k]), (tubes.second[s], print_.t[k])):
                 at = 3 * tubes.owner[point]
-                row[at : at + 3] -= (
-                    share * print_.d_distance[k] * (print_.normal[k] @ by_pixel[point])
-                )
+                row[at : at + 3] += share * (print_.d_axis[:, k] @ by_pixel[point])
                 row[3 * p + point] += share * print_.d_log_radius[k]
             sigma = target.sigma_mm.reshape(-1)[pixel]
             z = (target.path_mm.reshape(-1)[pixel] - model[pixel]) / (OPTIONS.robust_sigmas * sigma)

@@ -42,7 +42,7 @@ def at_the_fit(tree, carms):
 
 def weight(target, print_):
     """(rows * cols,) what each pixel counts at a fit that leaves nothing over."""
-    many = np.bincount(print_.pixel, minlength=target.path_mm.size)
+    many = np.bincount(print_.pixel, print_.path_mm > 0, minlength=target.path_mm.size)
     return (
         (target.pixel_mm / target.sigma_mm.reshape(-1)) ** 2
         / FLOOR
@@ -60,8 +60,8 @@ def test_a_pixel_is_one_equation_for_all_that_cross_it():
             s, t = print_.segment[k], print_.t[k]
             for point, share in ((tubes.first[s], 1 - t), (tubes.second[s], t)):
                 at = 3 * tubes.owner[point]
-                slope = share * print_.d_distance[k] * (print_.normal[k] @ by_pixel[point])
-                rows[pixel, at : at + 3] -= slope
+                slope = share * (print_.d_axis[:, k] @ by_pixel[point])
+                rows[pixel, at : at + 3] += slope
                 rows[pixel, p3 + point] += share * print_.d_log_radius[k]
         expected = rows.T @ (weight(target, print_)[:, None] * rows)
         found = seen_by(tubes, target, print_, OPTIONS).hessian().toarray()
@@ -142,12 +142,12 @@ def test_misfit_is_local_and_as_large_as_what_is_left_over():
     target, print_ = targets[0], prints[0]
     left = np.where(tubes.branch[print_.segment] == 0, 0.3, 0.0)
     found = misfit(tubes, target, print_, left)
-    alone = print_.crossings == 1
+    alone = (print_.crossings == 1) & (print_.path_mm > 0)
     z2 = (0.3 / target.sigma_mm.reshape(-1)[print_.pixel]) ** 2
     one = alone & (left > 0)
     assert found[one].min() > PATCH_MM2 * (z2[one].min() + LEAST_MISFIT) * 0.999
     assert found[one].max() < PATCH_MM2 * (z2[one].max() + LEAST_MISFIT) * 1.001
     np.testing.assert_allclose(found[alone & (left == 0)], FLOOR)
     # Who is to blame where both are: the worse of them, and the crossing.
-    both = found[~alone].reshape(-1)
+    both = found[(print_.crossings > 1) & (print_.path_mm > 0)]
     assert len(both) and (both >= CROSSED * PATCH_MM2 * (z2.min() + LEAST_MISFIT)).all()
