@@ -135,7 +135,7 @@ def paired(
 
 
 def _nearest_of_runs(run: Array, rank: Array) -> Array:
-    """(runs,) index of the nearest of each run, the first of ties; runs are numbered in order."""
+    """Find the nearest of each run, the first of ties, (runs,); runs are numbered in order."""
     if not len(run):
         return run
     best = np.full(run[-1] + 1, np.iinfo(np.int64).max)
