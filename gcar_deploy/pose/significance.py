@@ -37,6 +37,12 @@ _REACH = np.array([30.0, 8.0, 8.0, 0.15])
 _UNIT, _NOISE = np.array([1.0, 1.0, 1.0, 0.02]), 0.1
 _SHIFT, _TURN, _SCALE = [0], [0, 1, 2], [0, 3]
 _MOST_STEPS = 15
+#: Exact pictures that differ by no more than this, and whose squared difference falls by less than
+#: this factor where slopes are followed to their end, ask for nothing: that is half of what is
+#: significant (``asked_gain``), and as near to what fits gain as 5 % where that is up to 1.5
+_SMALL, _WORTH_A_FIT = 0.03, 1.15
+#: slopes are differences over such a share of a step
+_SLOPE_SHARE = 0.05
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,13 +95,16 @@ def asked(
         if fixed is None or moving is None:
             continue
         placed = dataclasses.replace(fixed, carm=poses[own.partner].applied(fixed.carm))
-        if separation_deg(placed.carm, moving.carm) < MOST_APART_DEG:
-            out.append(_asked(k, own.partner, _Pair(placed, moving, pose.coarse_mm, pose.fine_mm)))
+        pair = Pair(placed, moving, pose.coarse_mm, pose.fine_mm)
+        if separation_deg(placed.carm, moving.carm) < MOST_APART_DEG and not (
+            own.before <= _SMALL and pair.content
+        ):
+            out.append(_asked(k, own.partner, pair))
     return tuple(out)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Pair:
+class Pair:
     """Two views, and the coarse and fine smoothing of their profiles, mm."""
 
     fixed: Mass
@@ -112,6 +121,20 @@ class _Pair:
         if x[1] or x[2]:
             carm = carm.turned(float(x[1]), float(x[2]))
         return dataclasses.replace(self.moving, pixels=pixels), carm.moved(x[0] * normal)
+
+    @property
+    def content(self) -> bool:
+        """Whether exact pictures gain nothing by turn or scale, as far as slopes tell."""
+        if not (self.fixed.calibrated and self.moving.calibrated):
+            return False
+        rest = self.residuals(np.zeros(4), self.fine_mm)
+        steps = np.diag(_UNIT) * _SLOPE_SHARE
+        slopes = np.stack([self.residuals(x, self.fine_mm) - rest for x in steps], axis=1)
+        by_shift, *others = (
+            rest - slopes[:, free] @ np.linalg.lstsq(slopes[:, free], rest)[0]
+            for free in (_SHIFT, _TURN, _SCALE)
+        )
+        return all(by_shift @ by_shift < _WORTH_A_FIT * (left @ left) for left in others)
 
     @functools.cached_property
     def start(self) -> float:
@@ -165,7 +188,7 @@ class _Pair:
         )
 
 
-def _asked(view: int, partner: int, pair: _Pair) -> Asked:
+def _asked(view: int, partner: int, pair: Pair) -> Asked:
     shift = pair.fitted(_SHIFT)
     given = pair.left(shift)
     turn, scale = pair.fitted(_TURN), pair.fitted(_SCALE)

@@ -7,8 +7,8 @@ import pytest
 
 from gcar_deploy.config import QualityOptions, RunOptions
 from gcar_deploy.pose import register
-from gcar_deploy.pose.agreement import poses_between
-from gcar_deploy.pose.significance import asked
+from gcar_deploy.pose.agreement import poses_between, profiled
+from gcar_deploy.pose.significance import Pair, asked
 from gcar_deploy.quality import check_asked
 from tests.pose.test_agreement import pair
 
@@ -60,6 +60,21 @@ def test_a_wrong_scale_of_one_view_is_asked_for_with_its_factor(factor):
     one, (said,) = findings(told(views, pixel_spacing_mm=spacing))
     assert one.scale == pytest.approx(1 / factor, abs=0.02)
     assert "spacing, SDD or SOD" in said and ("smaller" if factor > 1 else "larger") in said
+
+
+@pytest.mark.parametrize(
+    ("by_deg", "scale", "content"), [(0, 1, True), (0.7, 1, False), (0, 1.01, False)]
+)
+def test_slopes_tell_whether_a_fit_is_worth_it(by_deg, scale, content):
+    fixed, moving = profiled(pair(calibrated=True)[1], OPTIONS)[0]
+    carm = moving.carm
+    spacing = tuple(scale * mm for mm in carm.pixel_spacing_mm)
+    off = dataclasses.replace(
+        carm, secondary_angle_deg=carm.secondary_angle_deg + by_deg, pixel_spacing_mm=spacing
+    )
+    assert Pair(fixed, dataclasses.replace(moving, carm=off), 1.5, 1.2).content == content
+    raw = dataclasses.replace(moving, calibrated=False)
+    assert not Pair(fixed, raw, 1.5, 1.2).content
 
 
 def test_the_registration_says_it():
