@@ -13,11 +13,10 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import plane_angles
+from gcar_deploy.quality.shown import CELLS_OFF, CELLS_ON, Shown
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
@@ -28,8 +27,6 @@ BIN_MM = 2.0
 #: vessels whose profiles differ by less than this share could be each other's. Ten trees: 0.19
 #: and more between branches with a free end, 0.01 to 0.13 between parallel bars of one width
 MOST_DIFFERENCE = 0.15
-#: vessel seen further than so many lattice cells from the tree's surface is another place
-CELLS_OFF = 2.0
 #: mean share of a ray's evidence that lies in other places. Eight trees: 0.001 to 0.1
 MOST_ELSEWHERE = 0.12
 
@@ -103,34 +100,26 @@ def exchanges(tree: Tree, carms: Sequence[CArm]) -> tuple[Exchange, ...]:
     return tuple(found)
 
 
-def evidence_elsewhere(tree: Tree, told: CenterPoints, rays: Array, weights: Array) -> float | None:
+def evidence_elsewhere(shown: Shown) -> float | None:
     """Share of the predictor's confidence on the tree's rays that lies off the tree.
-
-    Parameters
-    ----------
-    tree : Tree
-    told : n points as the predictor judged them, before any decision
-    rays : (views, n) ray of each point
-    weights : (views, n) path length of the ray in the point's cell
 
     Returns
     -------
-    mean over the points on the tree, each with its worst view; None without a tree
+    mean over the points on the tree, each with its worst view; None without a tree or evidence
     """
-    if not tree.branches or not len(told):
+    evidence = shown.evidence
+    if evidence is None or not shown.tree.branches or not len(evidence.points):
         return None
-    radii = np.append(tree.radii(), 0.0)
-    reach = float(radii.max()) + (CELLS_OFF + 1.0) * told.spacing_mm
-    # What lies further off than that is found at infinity: off in any case, and never on.
-    distance, nearest = cKDTree(tree.points()).query(told.points_mm, distance_upper_bound=reach)
-    gap = distance - radii[nearest]
+    told = evidence.points
+    # What lies far off is at infinity: off in any case, and never on.
+    gap, _ = shown.gap
     off = gap > CELLS_OFF * told.spacing_mm
-    on = gap < 0.5 * told.spacing_mm
+    on = gap < CELLS_ON * told.spacing_mm
     worst = np.zeros(len(told))
-    for ray, weight in zip(rays, weights, strict=True):
-        evidence = told.confidence * weight
-        whole = np.bincount(ray, evidence)
-        elsewhere = np.bincount(ray, evidence * off) / np.maximum(whole, 1e-9)
+    for ray, weight in zip(evidence.ray, evidence.weight, strict=True):
+        amount = told.confidence * weight
+        whole = np.bincount(ray, amount)
+        elsewhere = np.bincount(ray, amount * off) / np.maximum(whole, 1e-9)
         worst = np.maximum(worst, elsewhere[ray])
     total = float(told.confidence[on].sum())
     return float((worst[on] * told.confidence[on]).sum()) / total if total > 0 else None

@@ -7,17 +7,15 @@ rays are explained without it, the predictor saw more on them elsewhere, and it 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from gcar_deploy.geometry.epipolar import plane_normal
-from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.predict import Evidence
+from gcar_deploy.quality.shown import CELLS_OFF, CELLS_ON, Shown
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes import footprint, tubes_of
 from gcar_deploy.types import Array, Mask, Scalars
 
 #: branches are judged in stretches of at most this length, mm
@@ -40,9 +38,8 @@ FIGURES = (
     "exact",  # 1 of true path lengths
     "mask",  # 1 of masks
 )
-#: evidence nearer than so many cells is here, off the tree is what is further than the second
-#: from its surface; on it what is nearer than the third
-_HERE_CELLS, _OFF_CELLS, _ON_CELLS = 3.0, 2.0, 0.5
+#: evidence nearer than so many cells is here
+_HERE_CELLS = 3.0
 #: a ray is a stretch's own where all others add less than this share of its path
 _ALONE_SHARE = 0.3
 _LEAST_ODDS = 0.01
@@ -108,24 +105,25 @@ def stretches_of(tree: Tree) -> Stretches:
     )
 
 
-def ghost_figures(
-    tree: Tree, stretches: Stretches, views: Sequence[VesselImage], evidence: Evidence
-) -> Array:
+def ghost_figures(shown: Shown, evidence: Evidence, stretches: Stretches) -> Array:
     """(k, figures) of each stretch, by the names of ``FIGURES``.
 
     Parameters
     ----------
-    tree : Tree with a branch, mm LPS
-    stretches : of it
-    views : two or more, in the order and with the C-arms that ``evidence`` was made with
-    evidence : Evidence
+    shown : a tree with a branch, two views or more, in the order and with the C-arms that its
+        evidence was made with
+    evidence : that evidence
+    stretches : of the tree
     """
+    tree, views = shown.tree, shown.views
     told = evidence.points
-    near = cKDTree(told.points_mm).query(tree.points(), distance_upper_bound=2 * told.spacing_mm)[1]
+    # A plain tree of cells is built several times faster than a balanced one.
+    search = cKDTree(told.points_mm, balanced_tree=False, compact_nodes=False)
+    near = search.query(tree.points(), distance_upper_bound=2 * told.spacing_mm)[1]
     network = stretches.mean(np.append(told.confidence, 0.0)[near])
     network = logit(np.clip(network, _LEAST_ODDS, 1 - _LEAST_ODDS))
-    elsewhere, unclaimed = _on_rays(tree, stretches, views, evidence)
-    seen, alone = _in_pictures(tree, stretches, views)
+    elsewhere, unclaimed = _on_rays(shown, evidence, stretches)
+    seen, alone = _in_pictures(shown, stretches)
     lengths = np.array([branch.length_mm for branch in tree.branches])
     component = tree.components()[[branch.start for branch in tree.branches]]
     hanging = np.bincount(component, lengths)[component] / lengths.sum()
@@ -151,25 +149,19 @@ def ghost_figures(
     return np.stack([columns[name] for name in FIGURES], axis=1)
 
 
-def _on_rays(
-    tree: Tree, stretches: Stretches, views: Sequence[VesselImage], evidence: Evidence
-) -> tuple[Array, Array]:
+def _on_rays(shown: Shown, evidence: Evidence, stretches: Stretches) -> tuple[Array, Array]:
     """Share the evidence on a stretch's rays, (views, k): at other depths, and off the tree."""
-    told = evidence.points
-    cell = told.spacing_mm
-    radii = np.append(tree.radii(), 0.0)
-    reach = float(radii.max()) + (_OFF_CELLS + 1.0) * cell
-    gap, at = cKDTree(tree.points()).query(told.points_mm, distance_upper_bound=reach)
-    gap = gap - radii[at]
-    on = np.flatnonzero(gap < _ON_CELLS * cell)
-    of, near = stretches.point[at[on]], _HERE_CELLS * cell + radii[at[on]]
+    told, cell = evidence.points, evidence.points.spacing_mm
+    gap, at = shown.gap
+    on = np.flatnonzero(gap < CELLS_ON * cell)
+    of, near = stretches.point[at[on]], _HERE_CELLS * cell + shown.tree.radii()[at[on]]
     elsewhere, unclaimed = [], []
-    for view, ray, weight in zip(views, evidence.ray, evidence.weight, strict=True):
+    for view, ray, weight in zip(shown.views, evidence.ray, evidence.weight, strict=True):
         amount = told.confidence * weight
         depth = np.linalg.norm(told.points_mm - view.carm.source_mm, axis=1)
         whole = np.maximum(np.bincount(ray, amount), 1e-9)[ray[on]]
         here = _between(ray, depth, amount, on, near)
-        off = np.bincount(ray, amount * (gap > _OFF_CELLS * cell))[ray[on]]
+        off = np.bincount(ray, amount * (gap > CELLS_OFF * cell))[ray[on]]
         elsewhere.append(stretches.mean(1.0 - here / whole, of))
         unclaimed.append(stretches.mean(off / whole, of))
     return np.stack(elsewhere), np.stack(unclaimed)
@@ -187,15 +179,11 @@ def _between(ray: Array, depth: Scalars, amount: Scalars, on: Array, near: Scala
     return found
 
 
-def _in_pictures(
-    tree: Tree, stretches: Stretches, views: Sequence[VesselImage]
-) -> tuple[Array, Array]:
+def _in_pictures(shown: Shown, stretches: Stretches) -> tuple[Array, Array]:
     """Share a stretch's path, (views, k): what pictures leave to it, what lies on own rays."""
-    tubes = tubes_of(tree)
     seen: list[Scalars] = []
     alone: list[Scalars] = []
-    for view in views:
-        falls = footprint(tubes, view.carm, 1.0)
+    for view, falls in zip(shown.views, shown.prints, strict=True):
         of = stretches.segment[falls.segment]
         total = falls.image(view.mask.shape).reshape(-1)
         data = view.path_mm.reshape(-1).astype(np.float64)

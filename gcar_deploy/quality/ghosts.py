@@ -10,16 +10,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Sequence
 from importlib import resources
 
 import numpy as np
 from scipy.special import expit
 
 from gcar_deploy.config import QualityOptions
-from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.predict import Evidence
 from gcar_deploy.quality.ghost_figures import FIGURES, Stretches, ghost_figures, stretches_of
+from gcar_deploy.quality.shown import Shown
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
@@ -89,19 +87,12 @@ class Ghosts:
     figures: Array
 
 
-def find_ghosts(
-    tree: Tree,
-    views: Sequence[VesselImage],
-    evidence: Evidence | None,
-    model: GhostModel | None = None,
-) -> Ghosts | None:
+def find_ghosts(shown: Shown, model: GhostModel | None = None) -> Ghosts | None:
     """State the probability of a ghost along a tree.
 
     Parameters
     ----------
-    tree : Tree, mm LPS
-    views : what it was made from, with the C-arms and in the order of ``evidence``
-    evidence : what the predictor of all views said, or None
+    shown : the tree, its evidence with the C-arms and in the order of its views
     model : GhostModel; the shipped one where left out
 
     Returns
@@ -109,10 +100,11 @@ def find_ghosts(
     Ghosts; None without evidence or a branch, and of three and more views, which the model does
     not know
     """
-    if evidence is None or not tree.branches or len(views) != 2:
+    tree, evidence = shown.tree, shown.evidence
+    if evidence is None or not tree.branches or len(shown.views) != 2:
         return None
     stretches = stretches_of(tree)
-    figures = ghost_figures(tree, stretches, views, evidence)
+    figures = ghost_figures(shown, evidence, stretches)
     told = (model or shipped_model()).probability(figures)
     along = np.split(told[stretches.point], np.cumsum([len(b) for b in tree.branches])[:-1])
     weight = stretches.length_mm

@@ -24,8 +24,9 @@ from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.human_range import check_human_range
 from gcar_deploy.quality.scale import check_scale
 from gcar_deploy.quality.severed import check_severed
+from gcar_deploy.quality.shown import Shown
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes import footprint, tubes_of
+from gcar_deploy.tubes import Footprint
 from gcar_deploy.types import Array, Mask, Scalars
 
 OK, DEGRADED, REFUSED = "ok", "degraded", "refused"
@@ -126,24 +127,23 @@ def judge(
         As ``assess`` and ``check_scale``.
     """
     open_ = alternatives.exchanges(tree, [view.carm for view in views])
-    elsewhere = None if evidence is None else alternatives.evidence_elsewhere(
-        tree, evidence.points, evidence.ray, evidence.weight
-    )  # fmt: skip
-    ghosts = find_ghosts(tree, views, evidence)
+    shown = Shown(tree, views, evidence)
+    elsewhere = alternatives.evidence_elsewhere(shown)
+    ghosts = find_ghosts(shown)
     findings = [
         *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
         *check_human_range(tree), *check_ghosts(ghosts, options.quality),
         *check_anatomy(tree, [view.carm for view in views]), *check_border(tree, views),
         *check_severed(tree, views),
     ]  # fmt: skip
-    lumen = [_lumen(tree, v.carm) for v in views]
+    lumen = [_lumen(seen, v.carm) for seen, v in zip(shown.prints, views, strict=True)]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)
     return dataclasses.replace(judged, exchanges=open_, ghosts=ghosts)
 
 
-def _lumen(tree: Tree, carm: CArm) -> Mask:
+def _lumen(seen: Footprint, carm: CArm) -> Mask:
     """(rows, cols) bool: where the rays cross as much of the tree as counts as vessel."""
-    path = footprint(tubes_of(tree), carm, 1.0).image((carm.rows, carm.columns))
+    path = seen.image((carm.rows, carm.columns))
     inside: Mask = path > PATH_THRESHOLD_PIXELS * carm.pixel_at_isocenter_mm
     return inside
 

@@ -2,12 +2,13 @@
 
 from gcar_deploy.tubes.choice import CloseCall
 from gcar_deploy.tubes.gauss_newton import Ending
-from gcar_deploy.tubes.model import footprint, tubes_of
+from gcar_deploy.tubes.model import Footprint, footprint, tubes_of
 from gcar_deploy.tubes.refine import Refined, refine, refined_volume
 
 __all__ = [
     "CloseCall",
     "Ending",
+    "Footprint",
     "Refined",
     "footprint",
     "refine",

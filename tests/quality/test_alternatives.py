@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.predict import Evidence
 from gcar_deploy.quality.alternatives import evidence_elsewhere, exchanges, findings
+from gcar_deploy.quality.shown import Shown
 from tests.hard.phantoms import PAIR, bars, carm, seven, straight
 
 VIEWS = (carm(-40), carm(45))
@@ -51,6 +53,8 @@ def test_evidence_on_the_tree_and_beside_it():
     ones = np.ones((2, len(points)))
     apart, together = np.stack([own, own]), np.stack([own, ray])
     # One view sees both places on one ray, the other keeps them apart: the worst view counts.
-    assert evidence_elsewhere(tree, told, apart, ones) == pytest.approx(0)
-    assert evidence_elsewhere(tree, told, together, ones) == pytest.approx(0.25)
+    for rays, elsewhere in ((apart, 0.0), (together, 0.25)):
+        shown = Shown(tree, (), Evidence(told, rays, ones))
+        assert evidence_elsewhere(shown) == pytest.approx(elsewhere)
+    assert evidence_elsewhere(Shown(tree, (), None)) is None
     assert findings((), 0.25) and not findings((), 0.05)

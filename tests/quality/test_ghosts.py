@@ -17,6 +17,7 @@ from gcar_deploy.quality.ghosts import (
     find_ghosts,
     shipped_model,
 )
+from gcar_deploy.quality.shown import Shown
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes import footprint, tubes_of
 from tests.hard.phantoms import bars, carm, straight
@@ -47,7 +48,8 @@ def cells(tree, confidence):
 def figures(tree, shown, evidence=None):
     views = [picture(shown, view) for view in CARMS]
     stretches = stretches_of(tree)
-    found = ghost_figures(tree, stretches, views, evidence or cells(tree, 0.5))
+    told = evidence or cells(tree, 0.5)
+    found = ghost_figures(Shown(tree, views, told), told, stretches)
     return dict(zip(FIGURES, found.T, strict=True)), stretches
 
 
@@ -129,7 +131,7 @@ def test_probabilities_go_to_points_branches_tree_and_places():
     tree = bars(2)
     confidence = np.where(tree.branch_index() == 0, 0.9, 0.2)
     views = [picture(tree, view) for view in CARMS]
-    found = find_ghosts(tree, views, cells(tree, confidence), by_network())
+    found = find_ghosts(Shown(tree, views, cells(tree, confidence)), by_network())
     assert found.branches == pytest.approx([0.1, 0.8])
     assert [len(told) for told in found.points] == [len(branch) for branch in tree.branches]
     assert found.points[1] == pytest.approx(np.full(len(tree.branches[1]), 0.8))
@@ -146,8 +148,8 @@ def test_probabilities_go_to_points_branches_tree_and_places():
 def test_nothing_is_stated_without_evidence_or_of_three_views():
     tree = straight()
     views = [picture(tree, view) for view in CARMS]
-    assert find_ghosts(tree, views, None) is None
-    assert find_ghosts(tree, [*views, views[0]], cells(tree, 0.5)) is None
+    assert find_ghosts(Shown(tree, views, None)) is None
+    assert find_ghosts(Shown(tree, [*views, views[0]], cells(tree, 0.5))) is None
 
 
 def test_the_shipped_model_prefers_what_is_believed_and_seen():
