@@ -24,7 +24,7 @@ def skeletonize(mask: Mask) -> Mask:
     on = here.reshape(-1)
     edge = cv2.erode(here.astype(np.uint8), _BLOCK, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     due = [np.flatnonzero(on & (edge.reshape(-1) == 0))] * 2
-    half = 0
+    number, half = np.empty(len(on), np.int32), 0
     while len(due[0]) or len(due[1]):
         at, due[half] = due[half], due[half][:0]
         around = (on[at[:, None] + ring] << np.arange(8)).sum(axis=1)
@@ -33,9 +33,16 @@ def skeletonize(mask: Mask) -> Mask:
             on[gone] = False
             beside = (gone[:, None] + ring).reshape(-1)
             beside = beside[on[beside]]
-            due = [np.unique(np.concatenate([old[on[old]], beside])) for old in due]
+            due = [_once(np.concatenate([old[on[old]], beside]), number) for old in due]
         half = 1 - half
     return np.ascontiguousarray(here[1:-1, 1:-1])
+
+
+def _once(at: Array, number: Array) -> Array:
+    """Leave out what comes again; ``number`` is room for a number per pixel."""
+    order = np.arange(len(at), dtype=number.dtype)
+    number[at] = order
+    return at[number[at] == order]
 
 
 def _rules() -> tuple[Mask, Mask]:

@@ -106,7 +106,8 @@ def visual_hull(
         size = 2**level
         middle = index * size + (size - 1) / 2
         points = lattice.index2world(middle)
-        keep = (index * size < shape).all(axis=1)
+        x, y, z = (index * size < shape).T
+        keep = x & y & z
         for carm, path in views:
             keep[keep] = _supported(carm, path, points[keep], size * h, level == 0, h, options)
         index, points = index[keep], points[keep]

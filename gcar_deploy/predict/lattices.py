@@ -8,6 +8,7 @@ sees what falls between the points of the first; the mean of both is sampled at 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -46,15 +47,21 @@ def near_evidence(first: Candidates, confidence: Scalars, number: int) -> Array:
     -------
     (m, 3) int64, unique, within the lattice
     """
-    shape = np.asarray(first.lattice.shape)
-    steps = [np.arange(np.ceil(-s - 1.5), np.floor(-s + 1.5) + 1) for s in SHIFTS[number]]
-    offsets = np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3).astype(np.int64)
     believed = first.index[confidence >= ASKED_AGAIN]
-    index = (believed[:, None] + offsets).reshape(-1, 3)
-    index = index[((index >= 0) & (index < shape)).all(axis=1)]
-    marked = np.zeros(shape, bool)
-    marked[tuple(index.T)] = True
-    return np.argwhere(marked)
+    if not len(believed):
+        return believed
+    low = believed.min(axis=0) - 2
+    marked = np.zeros(believed.max(axis=0) + 3 - low, bool)
+    marked[tuple((believed - low).T)] = True
+    for axis, shift in enumerate(SHIFTS[number]):
+        # Nothing is marked near the faces, so that nothing comes round.
+        steps = range(math.ceil(-shift - 1.5), math.floor(-shift + 1.5) + 1)
+        marked = np.logical_or.reduce([np.roll(marked, step, axis) for step in steps])
+    outer = [slice(max(-a, 0), n - a) for a, n in zip(low, first.lattice.shape, strict=True)]
+    inner = np.zeros_like(marked)
+    inner[tuple(outer)] = marked[tuple(outer)]
+    at = np.unravel_index(np.flatnonzero(inner), inner.shape)
+    return np.stack(at, axis=1) + low
 
 
 def mean_evidence(

@@ -98,7 +98,7 @@ def usable_points(centers: CenterPoints) -> CenterPoints:
     Confidence is held to 0 .. 1 and a given radius to below ``MAX_GIVEN_RADIUS_MM``.
     """
     weight = np.nan_to_num(centers.confidence, nan=0.0, posinf=1.0, neginf=0.0)
-    keep = np.isfinite(centers.points_mm).all(axis=1) & (weight > 0)
+    keep = np.isfinite(centers.points_mm.sum(axis=1)) & (weight > 0)
     if keep.any():
         middle = np.median(centers.points_mm[keep], axis=0)
         reach = min(MAX_REACH_MM, 0.5 * centers.spacing_mm * MAX_CELLS ** (1 / 3))
@@ -129,7 +129,7 @@ def cell_graph(centers: CenterPoints) -> CellGraph:
     density = splat(at - low, centers.confidence, shape)
     value = blurred(density, SMOOTH_CELLS, 3.0)
     mask = hysteresis(value, LOW, HIGH)
-    cells = np.argwhere(mask)
+    cells = np.stack(np.unravel_index(np.flatnonzero(mask), mask.shape), axis=1)
     if not len(cells):
         return nothing
     pick = tuple(cells.T)

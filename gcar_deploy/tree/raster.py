@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from scipy import ndimage
+from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from gcar_deploy.types import Array, Scalars
@@ -22,12 +23,14 @@ def splat(at: Array, weight: Scalars, shape: Array) -> Array:
     """Trilinear deposit of (n,) weights at (n, 3) cell coordinates."""
     at = np.where(np.abs(at - np.rint(at)) < 1e-6, np.rint(at), at)
     base = np.floor(at).astype(np.int64)
-    share = at - base
+    # Of either neighbour along each axis: its share.
+    sides = [(1 - s, s) for s in np.ascontiguousarray((at - base).T)]
+    first = np.ravel_multi_index(tuple(base.T), tuple(shape))
     flat, part = [], []
-    for corner in np.ndindex(2, 2, 2):
-        w = weight * np.where(corner, share, 1 - share).prod(axis=1)
-        some = w > 0
-        flat.append(np.ravel_multi_index(tuple((base[some] + corner).T), tuple(shape)))
+    for x, y, z in np.ndindex(2, 2, 2):
+        w = weight * (sides[0][x] * sides[1][y] * sides[2][z])
+        some = np.flatnonzero(w > 0)
+        flat.append(first[some] + (x * shape[1] + y) * shape[2] + z)
         part.append(w[some])
     out = np.bincount(np.concatenate(flat), np.concatenate(part), minlength=int(shape.prod()))
     return out.reshape(shape)
@@ -73,12 +76,16 @@ def peaks(volume: Array) -> Array:
 
 
 def hysteresis(value: Array, low: float, high: float) -> Array:
-    """Cells from ``low`` on that are connected (26) to one from ``high`` on."""
-    labels, count = ndimage.label(value >= low, np.ones((3, 3, 3)))
-    strong = np.zeros(count + 1, bool)
-    strong[np.unique(labels[value >= high])] = True
-    strong[0] = False
-    return strong[labels]
+    """Cells from ``low`` on that are connected (26) to one from ``high`` on; none on the border."""
+    some = np.flatnonzero(value >= low)
+    pairs, _ = touching(np.stack(np.unravel_index(some, value.shape), axis=1), value.shape)
+    links = sparse.csr_matrix((np.ones(len(pairs)), pairs.T), shape=(len(some), len(some)))
+    count, part = csgraph.connected_components(links, directed=False)
+    strong = np.zeros(count, bool)
+    strong[part[value.reshape(-1)[some] >= high]] = True
+    out = np.zeros(value.shape, bool)
+    out.reshape(-1)[some[strong[part]]] = True
+    return out
 
 
 def depth_of(cells: Array, mask: Array) -> Scalars:

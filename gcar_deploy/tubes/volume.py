@@ -13,6 +13,7 @@ a Gaussian variable about the tubes' x0, correlated over about a voxel along the
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -289,14 +290,19 @@ def _deposited(centers: CenterPoints, grid: Grid, index: Array) -> Scalars:
     share = at - base
     low = index.min(axis=0)
     shape = index.max(axis=0) + 1 - low
-    flat, weight = [], []
-    for corner in np.ndindex(2, 2, 2):
-        place = base + corner - low
-        part = centers.confidence * np.where(corner, share, 1 - share).prod(axis=1)
-        ok = ((place >= 0) & (place < shape)).all(axis=1) & (part > 0)
-        flat.append(np.ravel_multi_index(tuple(place[ok].T), tuple(shape)))
-        weight.append(part[ok])
-    out = np.bincount(np.concatenate(flat), np.concatenate(weight), minlength=int(shape.prod()))
+    # Of either neighbour along each axis: its place, its share, and whether it lies inside.
+    sides = [
+        [(place, part, (place >= 0) & (place < n) & (part > 0))
+         for place, part in ((b, 1 - s), (b + 1, s))]
+        for b, s, n in zip((base - low).T, share.T, shape, strict=True)
+    ]  # fmt: skip
+    out = np.zeros(int(shape.prod()))
+    for (x, by_x, in_x), (y, by_y, in_y), (z, by_z, in_z) in itertools.product(*sides):
+        ok = np.flatnonzero(in_x & in_y & in_z)
+        if len(ok):
+            flat = (x[ok] * shape[1] + y[ok]) * shape[2] + z[ok]
+            weight = centers.confidence[ok] * (by_x[ok] * by_y[ok] * by_z[ok])
+            out += np.bincount(flat, weight, minlength=len(out))
     here: Scalars = out[np.ravel_multi_index(tuple((index - low).T), tuple(shape))]
     return here
 
