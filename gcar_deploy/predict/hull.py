@@ -130,20 +130,28 @@ def _supported(
 ) -> Array:
     pixels, depth = carm.project(points)
     ahead = depth > 1.0
+    least = options.min_path_cells * h
+    high = (path > least).astype(np.uint8)
     if finest:
-        least = options.min_path_cells * h
         # An interpolated value is at most that of the pixels around: most points end there.
-        high = cv2.dilate((path > least).astype(np.uint8), np.ones((3, 3), np.uint8))
+        high = cv2.dilate(high, np.ones((3, 3), np.uint8))
         keep = ahead & (_nearest(high, pixels, 1) > 0)
         keep[keep] = bilinear(path, pixels[keep]) > least
         return keep
-    # Footprint of the cell's circumscribed sphere, and a pixel or two for interpolation.
-    nearest = max(float(depth.min()), 1.0) if len(depth) else 1.0
-    reach = int(np.ceil(0.5 * np.sqrt(3) * edge * max(carm.focal_px) / nearest)) + 2
-    seen = cv2.dilate(
-        (path > 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    )
+    # The finest points of a block lie within a sphere; the pixels that one is interpolated from
+    # less than a pixel from it, and the pixel of the block's middle at most half a pixel.
+    nearest = max(float((depth - edge).min()), 1.0) if len(depth) else 1.0
+    sphere = 0.5 * np.sqrt(3) * (edge - h) * max(carm.focal_px) / nearest
+    reach = int(np.hypot(1.0, _tangent(carm)) * sphere + 1.5)
+    seen = cv2.dilate(high, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     return ahead & (_nearest(seen, pixels, reach) > 0)
+
+
+def _tangent(carm: CArm) -> float:
+    """Tangent of the angle between the axis and the ray of the picture's farthest corner."""
+    corner = np.array([[0.0, 0.0], [carm.columns, 0], [0, carm.rows], [carm.columns, carm.rows]])
+    away = (corner - carm.principal_point) / carm.focal_px
+    return float(np.linalg.norm(away, axis=1).max())
 
 
 def _nearest(picture: Array, pixels: Array, reach: int) -> Array:
