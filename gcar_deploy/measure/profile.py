@@ -76,14 +76,14 @@ class Fitted:
     residual: Array
 
 
-def blurred_chord(x_mm: Array, half_mm: Scalars, blur_mm: float) -> tuple[Array, Array, Array]:
+def blurred_chord(x_mm: Array, half_mm: Scalars, blur_mm: float | Scalars) -> tuple[Array, Array, Array]:
     """Chord of a lumen as deep as wide, over its half-width; and derivatives.
 
     Parameters
     ----------
     x_mm : (n, m) distance from the middle
     half_mm : (n,) half-width a
-    blur_mm : standard deviation of the blur
+    blur_mm : standard deviation of the blur, of all or (n,)
 
     Returns
     -------
@@ -131,7 +131,7 @@ def _table() -> Array:
 def fit_profiles(
     seen: Profiles,
     stretch: Scalars,
-    blur_mm: float,
+    blur_mm: float | Scalars,
     belief: Belief,
     noise: float,
 ) -> Fitted:
@@ -141,7 +141,7 @@ def fit_profiles(
     ----------
     seen : Profiles
     stretch : (n,) path over depth across the vessel: one over the sine between vessel and ray
-    blur_mm : standard deviation of the blur
+    blur_mm : standard deviation of the blur, of all or (n,)
     belief : Belief
     noise : of the signal, standard deviation of a pixel
     """
