@@ -76,7 +76,9 @@ class Fitted:
     residual: Array
 
 
-def blurred_chord(x_mm: Array, half_mm: Scalars, blur_mm: float | Scalars) -> tuple[Array, Array, Array]:
+def blurred_chord(
+    x_mm: Array, half_mm: Scalars, blur_mm: float | Scalars
+) -> tuple[Array, Array, Array]:
     """Chord of a lumen as deep as wide, over its half-width; and derivatives.
 
     Parameters
