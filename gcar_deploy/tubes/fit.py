@@ -14,6 +14,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.centerline import build_tree, usable_points
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.choice import (
+    MIN_SHARE,
     CloseCall,
     close_calls,
     kept_tree,
@@ -202,6 +203,8 @@ def _chosen(
     options, tree = run.options, now.tree
     targets = rescaled(targets, now.prints)
     pieces = weigh_pieces(tree, now.tubes, start_radius, targets)
+    if (pieces.share >= MIN_SHARE).all():
+        return now, close_calls(tree, pieces)
     steps = options.steps[0] // 2
     kept = run.fit(kept_tree(tree, pieces), targets, steps)
     prints = kept.prints or footprints(kept.tubes, targets)
