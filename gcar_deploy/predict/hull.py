@@ -131,7 +131,7 @@ def _supported(
     pixels, depth = carm.project(points)
     ahead = depth > 1.0
     least = options.min_path_cells * h
-    high = (path > least).astype(np.uint8)
+    high: Array = (path > least).astype(np.uint8)
     if finest:
         # An interpolated value is at most that of the pixels around: most points end there.
         high = cv2.dilate(high, np.ones((3, 3), np.uint8))
