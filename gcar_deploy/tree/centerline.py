@@ -99,18 +99,18 @@ def usable_points(centers: CenterPoints) -> CenterPoints:
     """
     weight = np.nan_to_num(centers.confidence, nan=0.0, posinf=1.0, neginf=0.0)
     keep = np.isfinite(centers.points_mm.sum(axis=1)) & (weight > 0)
-    if keep.any():
-        middle = np.median(centers.points_mm[keep], axis=0)
-        reach = min(MAX_REACH_MM, 0.5 * centers.spacing_mm * MAX_CELLS ** (1 / 3))
-        points = np.where(keep[:, None], centers.points_mm, middle)
-        keep &= np.abs(points - middle).max(axis=1) < reach
+    reach = min(MAX_REACH_MM, 0.5 * centers.spacing_mm * MAX_CELLS ** (1 / 3))
+    some = centers.points_mm[keep]
+    if len(some) and np.ptp(some, axis=0).max() >= reach:
+        middle = np.median(some, axis=0)
+        keep[keep] = np.abs(some - middle).max(axis=1) < reach
     radius = np.where(
         (centers.radius_mm > 0) & (centers.radius_mm < MAX_GIVEN_RADIUS_MM),
         centers.radius_mm,
         np.nan,
     )
     clean = dataclasses.replace(centers, confidence=np.clip(weight, 0.0, 1.0), radius_mm=radius)
-    return clean.select(keep)
+    return clean if keep.all() else clean.select(keep)
 
 
 def cell_graph(centers: CenterPoints) -> CellGraph:
