@@ -10,6 +10,7 @@ but blur adds the same variance to thin and to thick vessels, a wrong scale a sh
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -104,8 +105,14 @@ def scale_factor(tree: Tree, view: VesselImage) -> float | None:
     float, 1 where both agree; None where too few vessels stand alone in the picture, or where it
     looks below 1 and all are of one calibre: blur would look the same
     """
-    found = [_sections(branch, view) for branch in tree.branches if len(branch) > 2]
-    told, shown = np.concatenate(found, axis=1) if found else np.zeros((2, 0))
+    lines = [_profiles(branch, view) for branch in tree.branches if len(branch) > 2]
+    if not lines:
+        return None
+    # One look at the picture for all profiles.
+    sizes = np.cumsum([line.pixels.size // 2 for line in lines])
+    paths = bilinear(view.path_mm, np.concatenate([line.pixels.reshape(-1, 2) for line in lines]))
+    found = [_sections(*each) for each in zip(lines, np.split(paths, sizes[:-1]), strict=True)]
+    told, shown = np.concatenate(found, axis=1)
     if len(told) < _LEAST_PROFILES:
         return None
     plain = float(np.median(told / shown))
@@ -123,8 +130,25 @@ def _without_blur(told: Scalars, shown: Scalars, plain: float) -> float | None:
     return plain if y[0] <= x[0] / grown else max(plain, min(grown, 1.0))
 
 
-def _sections(branch: Branch, view: VesselImage) -> Array:
-    """(2, k) variance, mm^2, of each shadow that stands alone: by its integral, by its shape."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Profiles:
+    """Where n profiles across a branch's shadow are read.
+
+    Attributes
+    ----------
+    pixels : (n, m, 2) samples, (col, row)
+    x_px : (m,) their distance from the axis
+    size_mm, sine : (n,) pixel at the vessel's depth, and of the angle between vessel and ray
+    """
+
+    pixels: Array
+    x_px: Scalars
+    size_mm: Scalars
+    sine: Scalars
+
+
+def _profiles(branch: Branch, view: VesselImage) -> _Profiles:
+    """Profiles across those points of a branch that do not run along the ray."""
     pixels, depth = view.carm.project(branch.points_mm)
     size_mm = _pixel_mm(view.carm) * depth / view.carm.sdd_mm
     along = np.gradient(pixels, axis=0)
@@ -137,12 +161,16 @@ def _sections(branch: Branch, view: VesselImage) -> Array:
     good &= sine > _LEAST_SINE
     reach = max(_REACH_PX, _REACH_RADII * float(np.max(branch.radius_mm / size_mm)))
     x = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
-    at = pixels[:, None] + x[None, :, None] * normal[:, None]
-    path = bilinear(view.path_mm, at.reshape(-1, 2)).reshape(at.shape[:2])
-    area, variance, alone = _moments(path, x)
-    good &= alone & (variance > _LEAST_VARIANCE * _BLUR_PX2)
-    told = area * sine * size_mm / (4 * np.pi)
-    shown = (variance - _BLUR_PX2) * size_mm**2
+    at = pixels[good, None] + x[None, :, None] * normal[good, None]
+    return _Profiles(at, x, size_mm[good], sine[good])
+
+
+def _sections(line: _Profiles, path_mm: Array) -> Array:
+    """(2, k) variance, mm^2, of each shadow that stands alone: by its integral, by its shape."""
+    area, variance, alone = _moments(path_mm.reshape(line.pixels.shape[:2]), line.x_px)
+    good = alone & (variance > _LEAST_VARIANCE * _BLUR_PX2)
+    told = area * line.sine * line.size_mm / (4 * np.pi)
+    shown = (variance - _BLUR_PX2) * line.size_mm**2
     return np.stack([told[good], shown[good]])
 
 
