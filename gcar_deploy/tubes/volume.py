@@ -331,7 +331,7 @@ def _solve(
     variance: Scalars,
 ) -> Scalars:
     inverse = 1.0 / variance
-    GT, OT = G.T.tocsr(), O.T.tocsr()
+    GT, OT = G.T, O.T
 
     def apply(z: Scalars) -> Scalars:
         out: Scalars = z + GT @ (OT @ (inverse * (O @ (G @ z))))
