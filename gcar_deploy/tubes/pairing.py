@@ -21,6 +21,8 @@ BEND_OVERLAP = 2.0
 #: segments of one branch further apart than this in order, beyond as many as fit into half the
 #: reach, are separate crossings of a ray.
 RUN_GAP = 3
+#: of squared distances, of the 31 that single precision has
+RANK_BITS = 22
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,13 +84,12 @@ def paired(
     row, col, segment = _near_pixels(a, b, wide, ahead[first] & ahead[second], branch, shape)
     along = b - a
     inverse = 1.0 / np.maximum(np.einsum("ij,ij->i", along, along), 1e-12)
-    # Single precision: of segments as near as that either will do.
     table = np.concatenate([a, along, inverse[:, None], (wide**2)[:, None]], axis=1)
     many = np.bincount(segment, minlength=len(first))
-    x, y, dx, dy, inv, most = np.repeat(table.T.astype(np.float32), many, axis=1)
-    np.subtract(col, x, out=x, dtype=np.float32)
-    np.subtract(row, y, out=y, dtype=np.float32)
-    t = np.minimum(np.maximum((x * dx + y * dy) * inv, np.float32(0)), np.float32(1))
+    x, y, dx, dy, inv, most = np.repeat(table.T, many, axis=1)
+    np.subtract(col, x, out=x)
+    np.subtract(row, y, out=y)
+    t = np.minimum(np.maximum((x * dx + y * dy) * inv, 0.0), 1.0)
     x -= t * dx
     y -= t * dy
     distance2 = x * x + y * y
@@ -149,12 +150,15 @@ def _nearest_of_runs(run: Array, rank: Array) -> Array:
 def _by_pixel(pixel: Array, segment: Array, distance2: Scalars) -> tuple[Array, Array, Array]:
     """Sort by pixel, then segment; distances become whole numbers of the same order.
 
-    As digits of one number each, which sorts several times faster than an order is found.
+    As digits of one number each, which sorts several times faster than an order is found. What lies
+    beyond the joint of two segments is as far from either: some digits less than single precision
+    has, so that rounding does not say which comes first.
     """
     of_segment = int(segment.max(initial=0)).bit_length()
-    of_rank = min(62 - of_segment - int(pixel.max(initial=0)).bit_length(), 31)
+    of_rank = min(62 - of_segment - int(pixel.max(initial=0)).bit_length(), RANK_BITS)
     # Floats above 0 have the order of their bits.
-    rank = distance2.view(np.int32).astype(np.int64) >> (31 - of_rank)
+    bits = distance2.astype(np.float32).view(np.int32)
+    rank = bits.astype(np.int64) >> (31 - of_rank)
     key = (((pixel << of_segment) | segment) << of_rank) | rank
     key.sort()
     rank = key & ((1 << of_rank) - 1)

@@ -124,3 +124,17 @@ def test_path_is_continuous_where_segments_meet():
         for dx in (-1e-6, 1e-6)
     )
     assert np.abs(before - after).max() < 1e-3
+
+
+def test_where_a_picture_begins_does_not_say_which_segment_a_pixel_is_nearest_to():
+    # Pixels on the outside of a bend are as far from either segment: rounding must not choose.
+    tubes, view = tubes_of(fork()), carm(30, 20)
+    column, row = view.principal_point
+    wider = dataclasses.replace(
+        view, rows=view.rows + 7, columns=view.columns + 5, principal_point_px=(column + 5, row + 7)
+    )
+    a, b = (footprint(tubes, v, 1.0) for v in (view, wider))
+    np.testing.assert_array_equal(a.segment, b.segment)
+    np.testing.assert_array_equal(
+        (a.pixel // view.columns + 7) * wider.columns + a.pixel % view.columns + 5, b.pixel
+    )
