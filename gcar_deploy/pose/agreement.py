@@ -10,10 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcar_deploy.config import PoseOptions, RunOptions
-from gcar_deploy.geometry.consistency import Mass, vessel_mass
+from gcar_deploy.geometry.consistency import Mass, disagreement, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
+from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
@@ -118,27 +119,34 @@ def profiled(
 def with_motion(
     views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
 ) -> tuple[Pose, ...]:
-    """Return the poses of two exact views with the motion of the heart between them, if any.
+    """Return the poses of two views with the motion of the heart between them, if any.
 
-    Where there is some, the correction is estimated anew together with it; see ``motion``.
+    Where there is some, the correction is estimated anew together with it: from the mass profiles
+    of exact pictures (``motion``), from the frontier points of others (``frontier``).
     """
-    exact = all(view.calibrated for view in views)
-    rest = still(max(view.carm.pixel_at_isocenter_mm for view in views))
-    if len(views) != 2 or not (options.pose.enabled and exact) or poses[1].after <= rest:
+    if len(views) != 2 or not options.pose.enabled or poses[1].partner:
         return tuple(poses)
     masses, smoothing = profiled(views, options)
     fixed, moving = masses
-    if poses[1].partner or fixed is None or moving is None:
+    if fixed is None or moving is None:
         return tuple(poses)
-    found = estimate_motion(fixed, moving, poses[1].theta, smoothing)
-    if found is None:
+    if not all(view.calibrated for view in views):
+        found = by_frontiers(views, poses[1], bool(options.landmarks))
+        if found.motion is None and found.theta is poses[1].theta:
+            return poses[0], found
+        moved = moving if found.motion is None else dataclasses.replace(
+            moving, pixels=moving.pixels + found.motion.at(moving.carm, moving.pixels)
+        )  # fmt: skip
+        after = disagreement(fixed, moved, found.applied(moving.carm), smoothing.fine_mm)
+        return poses[0], dataclasses.replace(found, after=after)
+    rest = still(max(view.carm.pixel_at_isocenter_mm for view in views))
+    if poses[1].after <= rest:
         return tuple(poses)
-    (x, y, z, primary, secondary), motion, after = found
-    moved = dataclasses.replace(
-        poses[1], offset_mm=(float(x), float(y), float(z)), primary_deg=float(primary),
-        secondary_deg=float(secondary), after=after, motion=motion,
-    )  # fmt: skip
-    return poses[0], moved
+    estimate = estimate_motion(fixed, moving, poses[1].theta, smoothing)
+    if estimate is None:
+        return tuple(poses)
+    theta, motion, after = estimate
+    return poses[0], dataclasses.replace(poses[1].at(theta), after=after, motion=motion)
 
 
 def _smoothing(views: Sequence[VesselImage], options: RunOptions) -> PoseOptions:

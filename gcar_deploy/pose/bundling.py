@@ -68,7 +68,10 @@ def bundled(
             break
         arrived = bool(np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM)
         still = arrived and found.moving < ARRIVED_STEP
-        poses = tuple(_at(pose, t, still) for pose, t in zip(poses, found.theta, strict=True))
+        poses = tuple(
+            dataclasses.replace(pose.at(t), converged=still)
+            for pose, t in zip(poses, found.theta, strict=True)
+        )
         if arrived:
             break
     return first if poses == first else poses_between(views, options, poses)
@@ -80,14 +83,3 @@ def posed(view: VesselImage, pose: Pose) -> VesselImage:
         view = pose.motion.undone(view)
     carm = pose.applied(view.carm)
     return view if carm is view.carm else dataclasses.replace(view, carm=carm)
-
-
-def _at(pose: Pose, theta: np.ndarray, converged: bool) -> Pose:
-    x, y, z, primary, secondary = (float(value) for value in theta)
-    return dataclasses.replace(
-        pose,
-        offset_mm=(x, y, z),
-        primary_deg=primary,
-        secondary_deg=secondary,
-        converged=converged,
-    )

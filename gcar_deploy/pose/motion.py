@@ -140,6 +140,51 @@ class Motion:
         return column + dx, row + dy
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Modes:
+    """Leading modes of a smooth motion across the epipolar planes, each standard normal beforehand.
+
+    Attributes
+    ----------
+    nodes_mm, direction : as of ``Motion``
+    weights : (m, k) of the kernel at each node, of every mode
+    """
+
+    nodes_mm: Array
+    weights: Array
+    direction: Array
+
+    @classmethod
+    def of(cls, fixed: CArm, carm: CArm, pixels: Pixels) -> Modes:
+        """Return those of a view beside ``fixed`` whose vessels are (n, 2) ``pixels``."""
+        places = (pixels - np.array(carm.principal_point)) * _pixel_mm(carm)
+        nodes = places[np.linspace(0, len(places) - 1, min(NODES, len(places))).astype(np.int64)]
+        values, vectors = np.linalg.eigh(_kernel(nodes, nodes))
+        count = min(MODES, len(nodes))
+        modes = MOTION_MM * vectors[:, -count:] / np.sqrt(np.maximum(values[-count:], 1e-9))
+        normal = plane_normal(fixed, carm)
+        direction = np.array([normal @ carm.axes[0], normal @ carm.axes[1]])
+        return cls(nodes, modes, direction / np.linalg.norm(direction))
+
+    @property
+    def count(self) -> int:
+        """How many modes."""
+        return self.weights.shape[1]
+
+    def at(self, carm: CArm, pixels: Pixels) -> Array:
+        """(n, k) displacement of (n, 2) pixels by each mode, mm."""
+        places = (pixels - np.array(carm.principal_point)) * _pixel_mm(carm)
+        out: Array = _kernel(places, self.nodes_mm) @ self.weights
+        return out
+
+    def motion(self, x: Scalars, rms_mm: float) -> Motion:
+        """Return the motion with (k,) weights of the modes."""
+        return Motion(
+            nodes_mm=self.nodes_mm, weights=self.weights @ x, direction=self.direction,
+            rms_mm=rms_mm,
+        )  # fmt: skip
+
+
 def still(pixel_mm: float) -> float:
     """Disagreement of two placed pictures, 0 .. 1, up to which nothing has moved."""
     return max(STILL, STILL_PER_MM * pixel_mm)
@@ -165,17 +210,10 @@ def estimate_motion(
     if not (fixed.calibrated and moving.calibrated) or before <= STILL:
         return None
     carm = moving.carm
-    size = _pixel_mm(carm)
-    places = (moving.pixels - np.array(carm.principal_point)) * size
-    nodes = places[np.linspace(0, len(places) - 1, min(NODES, len(places))).astype(np.int64)]
-    values, vectors = np.linalg.eigh(_kernel(nodes, nodes))
-    count = min(MODES, len(nodes))
-    modes = MOTION_MM * vectors[:, -count:] / np.sqrt(np.maximum(values[-count:], 1e-9))
-    basis = _kernel(places, nodes) @ modes
+    field = Modes.of(fixed.carm, carm, moving.pixels)
+    basis, count = field.at(carm, moving.pixels), field.count
     normal = plane_normal(fixed.carm, carm)
-    direction = np.array([normal @ carm.axes[0], normal @ carm.axes[1]])
-    direction /= np.linalg.norm(direction)
-    along = direction / size
+    along = field.direction / _pixel_mm(carm)
 
     def pose(x: Array) -> Array:
         return np.concatenate([x[0] * normal, x[1:FREE]])
@@ -214,8 +252,7 @@ def estimate_motion(
     rms_mm = float((basis @ x[FREE:]).std())
     if after > min(LEAST_GAIN * before, MOST_LEFT) or rms_mm > MOST_MM or abs(x[0]) > SEARCH_MM:
         return None
-    motion = Motion(nodes_mm=nodes, weights=modes @ x[FREE:], direction=direction, rms_mm=rms_mm)
-    return pose(x), motion, after
+    return pose(x), field.motion(x[FREE:], rms_mm), after
 
 
 def _pixel_mm(carm: CArm) -> Array:

@@ -65,6 +65,8 @@ class Pose:
         False where the correction is that of a fit that was stopped at its cap.
     motion : Motion or None
         Smooth motion of the heart beyond a shift, which is undone in this view's picture.
+    left_mm : float
+        Root mean square of such a motion that was seen and could not be undone.
     """
 
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -77,11 +79,12 @@ class Pose:
     landmark_after_mm: float | None = None
     converged: bool = True
     motion: Motion | None = None
+    left_mm: float = 0.0
 
     @property
     def motion_mm(self) -> float:
         """Root mean square of the motion beyond a shift, as far as two views see it."""
-        return 0.0 if self.motion is None else self.motion.rms_mm
+        return self.left_mm if self.motion is None else self.motion.rms_mm
 
     @property
     def shift_mm(self) -> float:
@@ -92,6 +95,13 @@ class Pose:
     def turn_deg(self) -> float:
         """The larger of the two angle corrections."""
         return max(abs(self.primary_deg), abs(self.secondary_deg))
+
+    def at(self, theta: Array) -> Pose:
+        """Return the pose with another (5,) correction."""
+        x, y, z, primary, secondary = (float(value) for value in theta)
+        return dataclasses.replace(
+            self, offset_mm=(x, y, z), primary_deg=primary, secondary_deg=secondary
+        )
 
     def applied(self, carm: CArm) -> CArm:
         """Return the view with the correction built in."""

@@ -100,9 +100,11 @@ def register(
     findings += order
     # Pictures that agree far better the other way round are swapped: no heart has moved.
     poses = rigid if hint else with_motion(views, rigid, options)
-    findings += check_motion(
-        views, [(p.motion_mm, q.after) for p, q in zip(poses, rigid, strict=True)], options.quality
-    )
+    motions = [
+        (pose.motion_mm, pose.motion is not None, before.after)
+        for pose, before in zip(poses, rigid, strict=True)
+    ]
+    findings += check_motion(views, motions, options.quality)
     for one in asked(views, rigid, options):
         ids = views[one.partner].view_id, views[one.view].view_id
         turn = one.turn_deg, one.turned, one.turn_gain

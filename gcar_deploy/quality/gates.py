@@ -211,23 +211,36 @@ def check_poses(
 
 
 def check_motion(
-    views: Sequence[VesselImage], motions: Sequence[tuple[float, float]], options: QualityOptions
+    views: Sequence[VesselImage],
+    motions: Sequence[tuple[float, bool, float]],
+    options: QualityOptions,
 ) -> list[str]:
     """Judge the motion of the heart between the runs, beyond a shift.
 
     Parameters
     ----------
     views : V vessel images
-    motions : (V,) root mean square across the epipolar planes in mm (0: none was found), and the
-        disagreement with a rigid correction alone, 0 .. 1
+    motions : (V,) root mean square across the epipolar planes in mm (0: none was found), whether
+        it is undone, and the disagreement with a rigid correction alone, 0 .. 1
     """
-    return [
-        f"view {view.view_id}: beyond a shift the heart moved by {moved:.1f} mm (root mean square) "
-        "across the planes of the beams; that is undone, but as much within the planes leaves no "
-        "trace and bends the tree"
-        for view, (moved, rigid) in zip(views, motions, strict=True)
-        if moved > options.good_motion_mm or (moved and rigid > options.good_disagreement)
-    ]
+    findings = []
+    exact = kind_of(views) == "exact"
+    for view, (moved, undone, rigid) in zip(views, motions, strict=True):
+        told = f"view {view.view_id}: beyond a shift the heart moved by {moved:.1f} mm "
+        where = "(root mean square) across the planes of the beams"
+        # Masks and raw pictures show motion only where it bends the tree.
+        small = exact and moved <= options.good_motion_mm and rigid <= options.good_disagreement
+        if moved and undone and not small:
+            findings.append(
+                f"{told}{where}; that is undone, but as much within the planes leaves no trace "
+                "and bends the tree"
+            )
+        elif moved and not undone:
+            findings.append(
+                f"{told}or more {where}, or an angle is wrong: vessels of both pictures turn and "
+                "end in other planes; that is not undone and bends the tree"
+            )
+    return findings
 
 
 def _is_cut(mask: Mask) -> bool:

@@ -121,7 +121,12 @@ def test_motion_that_bends_the_tree_degrades():
         extract_vessels(angiogram(k, trees(0.0)[0]), RunOptions().imaging, None) for k in (0, 1)
     ]
     limits = QualityOptions()
-    assert not check_motion(views, [(0.0, 0.2), (0.4, 0.02)], limits)
-    (large,) = check_motion(views, [(0.0, 0.0), (0.6, 0.02)], limits)
-    assert "view 2" in large and "0.6 mm" in large
-    assert check_motion(views, [(0.0, 0.0), (0.1, 0.06)], limits)
+    none = (0.0, False, 0.2)
+    assert not check_motion(views, [none, (0.4, True, 0.02)], limits)
+    (large,) = check_motion(views, [none, (0.6, True, 0.02)], limits)
+    assert "view 2" in large and "0.6 mm" in large and "that is undone" in large
+    assert check_motion(views, [none, (0.1, True, 0.06)], limits)
+    inexact = [dataclasses.replace(view, path_error=0.2, kind="mask") for view in views]
+    (undone,) = check_motion(inexact, [none, (0.4, True, 0.02)], limits)
+    (left,) = check_motion(inexact, [none, (0.4, False, 0.02)], limits)
+    assert "that is undone" in undone and "0.4 mm or more" in left
