@@ -46,7 +46,7 @@ from gcar_export.studies.pose_table import aligned, chamfer_mm
 from gcar_export.studies.wrong_scenes import SPREAD_DEG, picture_of
 
 SEED = 91_001
-LEVELS_MM = (0.0, 1.0, 2.0, 4.0, 6.0)
+LEVELS_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0)
 ARMS = ("rigid", "auto", "across")
 #: set-up and kind of picture
 PROTOCOLS = ("paper", "clinical", "mask", "raw")
@@ -243,8 +243,8 @@ def table(rows: Sequence[Row]) -> str:
     """Markdown: a row per protocol, level and arm."""
     out = [
         "| pictures | motion mm | arm | pairs | DSC % | shape mm | of view 1 | of the mean | "
-        "wrong % | missed % | reported mm | ok / degraded / refused | ok and off |",
-        "|---" * 13 + "|",
+        "wrong % | missed % | told | reported mm | ok / degraded / refused | ok and off |",
+        "|---" * 14 + "|",
     ]
     keys = sorted({(PROTOCOLS.index(r.protocol), r.level_mm, ARMS.index(r.arm)) for r in rows})
     for protocol, level, arm in keys:
@@ -259,7 +259,8 @@ def table(rows: Sequence[Row]) -> str:
             _mean([r.dsc for r in own], 100, 1), *(_mean([getattr(r, key) for r in own], 1, 2)
             for key in ("shape_mm", "first_mm", "mean_mm")),
             *(_mean([getattr(r, key) for r in own], 100, 1) for key in ("wrong", "missed")),
-            _mean([max(r.motion_mm, default=0.0) for r in own], 1, 2),
+            str(sum(any(r.motion_mm) for r in own)),
+            _mean([max(r.motion_mm, default=0.0) for r in own if any(r.motion_mm)], 1, 2),
             " / ".join(map(str, counts)), str(off),
         ]  # fmt: skip
         out.append("| " + " | ".join(cells) + " |")

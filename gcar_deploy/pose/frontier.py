@@ -23,7 +23,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import plane_normal, plane_slices
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.joint import corrected
-from gcar_deploy.pose.motion import Modes, Motion
+from gcar_deploy.pose.motion import DIGITS, Modes, Motion
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.types import Array, Pixels, Scalars
 
@@ -43,9 +43,11 @@ MODE = 0.75
 #: pixels coarser than so many mm blur what stands out and how well it matches
 FINE_MM = 0.4
 #: masks show motion where its estimate is larger than this, mm, or where fewer of the points match
-#: those of a rigid heart; raw pictures, whose vessels end where their contrast does, from the
-#: second figure on. Chosen on 30 generated trees at rest and moving by 1, 2 and 4 mm
-MASK_MM, LEAST_MATCHED, RAW_MM = 0.3, 0.6, 0.6
+#: those of a rigid heart; raw pictures, whose vessels end where their contrast does, by the
+#: estimate alone. A heart that moved must be so much likelier than one at rest in the pose as
+#: given. Chosen on 60 generated pairs of masks at rest and 45 of raw pictures, and as many moved
+MASK_MM, LEAST_MATCHED, MASK_GAIN = 0.3, 0.6, 3.0
+RAW_MM, RAW_GAIN = 0.55, 8.0
 #: fewer points than this tell nothing. What masks tell is undone where so many points, and such a
 #: share of them, match then, and it is so much likelier; a rigid correction the same
 LEAST_POINTS, UNDONE, PLACED = 3, (7, 0.8, 5.0), (3, 0.7, 3.0)
@@ -114,13 +116,11 @@ def frontier_points(view: VesselImage, pair: tuple[CArm, CArm]) -> Frontier:
     mask = view.mask[corner[0] : corner[0] + shape[0], corner[1] : corner[1] + shape[1]]
     pixel = view.carm.pixel_at_isocenter_mm
     inside = _long_parts(mask, pixel)
-    border = (cv2.BORDER_CONSTANT, -1e3)
     found = []
     for side in (1.0, -1.0):
-        across = np.full(shape, -1e3, np.float32)
+        across = np.full(shape, -1e3)
         across[rows, cols] = side * _reach_mm(pair) * angle
-        top = cv2.dilate(across, np.ones((5, 5), np.uint8), borderType=border[0],
-                         borderValue=border[1])  # fmt: skip
+        top = cv2.dilate(across, np.ones((5, 5), np.uint8))
         kept: list[tuple[int, int]] = []
         for row, col in np.argwhere(inside & (across == top)).tolist():
             at = np.array([row, col]) + corner
@@ -214,15 +214,17 @@ def by_frontiers(views: Sequence[VesselImage], pose: Pose, marked: bool) -> Pose
     if told is None or told.count < LEAST_POINTS:
         return pose
     coarse = coarser(max(view.carm.pixel_at_isocenter_mm for view in views))
+    seen_mm, gain = told.motion.rms_mm, told.gain + told.moving_gain
     if not all(view.calibrated or view.kind == "mask" for view in views):
-        seen = told.motion.rms_mm
-        return dataclasses.replace(pose, left_mm=seen) if seen > RAW_MM * coarse else pose
+        moved = seen_mm > RAW_MM * coarse and gain > RAW_GAIN
+        return dataclasses.replace(pose, left_mm=seen_mm) if moved else pose
     found, limit_mm = (told.count, told.matched, told.gain), MASK_MM * coarse
-    if told.motion.rms_mm <= limit_mm and told.matched >= LEAST_MATCHED:
-        return pose if marked or not _reaches(found, PLACED) else pose.at(told.theta)
+    clear = seen_mm <= limit_mm and told.matched >= LEAST_MATCHED
+    if clear or gain <= MASK_GAIN:
+        return pose if marked or not clear or not _reaches(found, PLACED) else pose.at(told.theta)
     if not marked and _reaches((told.count, told.moving_matched, told.moving_gain), UNDONE):
         return dataclasses.replace(pose.at(told.moving_theta), motion=told.motion)
-    return dataclasses.replace(pose, left_mm=max(told.motion.rms_mm, limit_mm))
+    return dataclasses.replace(pose, left_mm=max(seen_mm, limit_mm))
 
 
 def _reaches(found: tuple[float, ...], least: tuple[float, ...]) -> bool:
@@ -319,6 +321,7 @@ class _Match:
                 weighted = J.T * w[some]
                 pull = weighted @ gap[some] + rest @ x[:free]
                 x[:free] -= np.linalg.solve(weighted @ J + rest, pull)
+        x = np.round(x, DIGITS)
         value, partner, _ = self.evidence(x)
         return x, value, partner
 
