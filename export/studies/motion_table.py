@@ -119,7 +119,7 @@ def make_pair(protocol: str, number: int, level_mm: float, arm: str) -> Pair:
     trees = tree, moved_tree(tree, motion, kept)
     kind = "path_length" if protocol in ("paper", "clinical") else protocol
     pictures = tuple(
-        _picture(k, carm, own, kind, rng)
+        picture_of_tree(k, carm, own, kind, rng)
         for k, (carm, own) in enumerate(zip(carms, trees, strict=True))
     )
     return Pair(pictures, (carms[0], carms[1]), grid, trees)  # type: ignore[arg-type]
@@ -194,9 +194,10 @@ def _occupied(tree: SyntheticTree, grid: Grid) -> np.ndarray:
     return out.reshape(grid.shape)
 
 
-def _picture(
+def picture_of_tree(
     number: int, carm: CArm, tree: SyntheticTree, kind: str, rng: np.random.Generator
 ) -> Angiogram:
+    """Make a picture of a tree; ``kind`` as of ``Intensity``."""
     pixels = picture_of(path_lengths(carm, *tree.segments()), kind, rng)
     exact = kind == "path_length"
     return Angiogram(
