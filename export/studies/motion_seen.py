@@ -1,7 +1,7 @@
 """How often motion shows in masks and raw pictures: ``python -m gcar_export.studies.motion_seen``.
 
-Generated trees, left and right, in two views that stand anywhere C-arms do, with pixels of 0.25 to
-0.8 mm (masks) or 0.25 to 0.45 mm (raw); before the second one the heart deforms smoothly
+Generated trees, left and right, in two views that stand anywhere C-arms do, with pixels of 0.3 to
+0.8 mm (masks) or 0.3 to 0.45 mm (raw); before the second one the heart deforms smoothly
 (``scenes/motion``), and every third patient is shifted. No tree is made: what the pose says of the
 motion is held against how far the rays of true points pass each other (gap), which is what two
 views can see of it.
@@ -10,6 +10,7 @@ views can see of it.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
@@ -17,6 +18,7 @@ from typing import TypeAlias
 import numpy as np
 
 from gcar_deploy.config import RunOptions
+from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import ray_gaps
 from gcar_deploy.imaging.extract import extract_vessels
@@ -25,15 +27,17 @@ from gcar_deploy.pose.agreement import agreeing, with_motion
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Points
-from gcar_export.scenes.gantry import clinical_views
+from gcar_export.scenes.gantry import Field, clinical_views, focused
 from gcar_export.scenes.motion import heart_motion, moved_tree
 from gcar_export.scenes.trees import SIDES, random_tree, rough_style
 from gcar_export.studies.motion_table import picture_of_tree
 
 SEED, LEVELS_MM = 91_002, (0.0, 1.0, 2.0, 3.0, 4.0, 6.0)
-PIXELS_MM = {"mask": (0.25, 0.8), "raw": (0.25, 0.45)}
+PIXELS_MM = {"mask": (0.3, 0.8), "raw": (0.3, 0.45)}
 #: standard deviation of a patient's shift along each axis, mm; smaller gaps are no matter, mm
 SHIFT_MM, SMALL_MM = 2.0, 0.6
+#: what the pictures show
+FIELD = Field(middle_mm=np.zeros(3), radius_mm=75.0)
 #: motion, told, undone, placed, gap by the rigid pose and by the one that is used
 Row: TypeAlias = tuple[float, bool, bool, bool, float, float]
 
@@ -44,7 +48,8 @@ def seen(kind: str, trees: int, levels: Sequence[float] = LEVELS_MM) -> Iterator
     segmenter = load_segmenter(wanted, 1) if kind == "raw" else None
     for number in range(trees):
         for level in levels:
-            yield judged(kind, number, level, segmenter)
+            with contextlib.suppress(RefusedError):  # no vessel found
+                yield judged(kind, number, level, segmenter)
 
 
 def judged(kind: str, number: int, level: float, segmenter: Segmenter | None = None) -> Row:
@@ -52,7 +57,8 @@ def judged(kind: str, number: int, level: float, segmenter: Segmenter | None = N
     options = RunOptions()
     rng = np.random.default_rng([SEED, number])
     tree = random_tree(rng, (None, rough_style(rng))[number // 2 % 2]).sides(SIDES[number % 2])
-    carms = clinical_views(rng, 2, float(rng.uniform(*PIXELS_MM[kind])))
+    views = clinical_views(rng, 2, float(rng.uniform(*PIXELS_MM[kind])))
+    carms = [focused(carm, FIELD) for carm in views]
     every = np.concatenate([resample(v.points_mm, 1.0) for v in tree.vessels])
     motion = heart_motion(rng, every, level)
     shift = SHIFT_MM * rng.normal(size=3) * (number % 3 == 0)
@@ -64,8 +70,8 @@ def judged(kind: str, number: int, level: float, segmenter: Segmenter | None = N
         for k, (carm, own) in enumerate(zip(carms, trees, strict=True))
     ]
     found = [extract_vessels(p, options.imaging, segmenter) for p in pictures]
-    views, rigid, _ = agreeing(pictures, found, options)
-    pose = with_motion(views, rigid, options)[1]
+    kept, rigid, _ = agreeing(pictures, found, options)
+    pose = with_motion(kept, rigid, options)[1]
     lines = [np.concatenate([v.points_mm for v in own.vessels]) for own in trees]
     undone, told = pose.motion is not None, pose.motion_mm > 0
     placed = not told and bool((pose.theta != rigid[1].theta).any())

@@ -186,7 +186,9 @@ def agree_at_frontiers(fixed: VesselImage, moving: VesselImage, theta: Array) ->
     )
     if not all(len(p.pixels) for p in points):
         return None
-    match = _Match.of(points[0], points[1], pair, np.argwhere(moving.mask)[:, ::-1])
+    match = _Match.of(
+        points[0], points[1], pair, np.argwhere(moving.mask)[:, ::-1].astype(np.float64)
+    )
     rest = match.evidence(np.zeros(POSE + match.field.count))[0]
     rigid, moved = match.best(POSE), match.best(POSE + match.field.count)
     motion_mm = match.field.at(carm, match.vessel) @ moved[0][POSE:]
@@ -210,7 +212,7 @@ def by_frontiers(views: Sequence[VesselImage], pose: Pose, marked: bool) -> Pose
     pose : of the second, by mass profiles
     marked : whether a person said which points are the same; then only motion is told
     """
-    told = agree_at_frontiers(*views, pose.theta)
+    told = agree_at_frontiers(views[0], views[1], pose.theta)
     if told is None or told.count < LEAST_POINTS:
         return pose
     coarse = coarser(max(view.carm.pixel_at_isocenter_mm for view in views))
