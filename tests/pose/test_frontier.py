@@ -13,7 +13,13 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.pose.agreement import poses_between, with_motion
-from gcar_deploy.pose.frontier import RAW_MM, agree_at_frontiers, by_frontiers, frontier_points
+from gcar_deploy.pose.frontier import (
+    RAW_MM,
+    _Match,
+    agree_at_frontiers,
+    by_frontiers,
+    frontier_points,
+)
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.quality import check_motion
 
@@ -82,6 +88,17 @@ def test_points_lie_where_the_outline_touches_its_planes():
         own = plane_slices(*TOLD, view.carm, np.array([[col, row]]))[0]
         near = np.maximum(np.abs(cols - col), np.abs(rows - row)) <= 2
         assert (side * across[near] <= side * own + 1e-6).all()
+
+
+def test_partners_are_of_one_side_and_of_about_one_mass():
+    first, second = (frontier_points(view, TOLD) for view in masks(trees(0.0)))
+    match = _Match.of(first, second, TOLD, second.pixels)
+    same = first.side[:, None] == second.side[None]
+    assert ((match.likely > 0) == same).all()
+    apart = first.mass[:, None] - second.mass[None]
+    apart = np.abs(apart - np.median(first.mass) + np.median(second.mass))[same]
+    order = np.argsort(apart)
+    assert (np.diff(match.likely[same][order]) <= 1e-9).all()
 
 
 def test_a_heart_at_rest_is_left_where_it_stands():
