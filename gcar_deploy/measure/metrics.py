@@ -8,6 +8,7 @@ convention. Volumes are indexed (x, y, z); distances are in mm between voxel cen
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,6 +23,10 @@ VOLUME_THRESHOLD = 0.5
 BEST_THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 #: path length that counts as vessel in a new projection, mm.
 PROJECTION_THRESHOLD_MM = 0.5
+#: all that ``volume_measures`` knows of
+VOLUME_MEASURES = (
+    "dsc", "best_dsc", "best_threshold", "ot_1mm", "ot_2mm", "chamfer_mm", "cldice", "ssim",
+)  # fmt: skip
 #: window edge of SSIM, voxels.
 SSIM_WINDOW = 7
 #: slack on "within r mm", so that a distance equal to r counts whatever its rounding.
@@ -98,11 +103,11 @@ def skeleton(mask: Array, spacing_mm: Sequence[float] | Array) -> Skeleton:
     from skimage.morphology import skeletonize
 
     spacing = np.asarray(spacing_mm, dtype=np.float64)
-    filled = np.argwhere(mask)
-    if not len(filled):
-        return Skeleton(index=filled, spacing_mm=spacing)
-    low, high = filled.min(0), filled.max(0) + 1
-    core = mask[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    filled = [np.flatnonzero(mask.any(axis=other)) for other in ((1, 2), (0, 2), (0, 1))]
+    if not len(filled[0]):
+        return Skeleton(index=np.zeros((0, 3), np.int64), spacing_mm=spacing)
+    low = np.array([own[0] for own in filled])
+    core = mask[tuple(slice(own[0], own[-1] + 1) for own in filled)]
     # One empty voxel all round keeps the result independent of where the box was cut.
     thin = skeletonize(np.pad(core, 1))
     return Skeleton(index=np.argwhere(thin) - 1 + low, spacing_mm=spacing)
@@ -208,32 +213,32 @@ def volume_measures(
     truth: Array,
     predicted: Array | None,
     spacing_mm: Sequence[float] | Array,
-    *,
-    structure: bool = True,
+    names: Sequence[str] = VOLUME_MEASURES,
 ) -> dict[str, Measure]:
-    """All measures of two occupancy volumes on one grid, by name.
+    """Measures of two occupancy volumes on one grid, by name.
 
-    Keys: ``dsc``, ``best_dsc``, ``best_threshold``, ``ot_1mm``, ``ot_2mm``, ``chamfer_mm``,
-    ``cldice``, ``ssim``. Masks and skeletons are taken at 0.5. Without ``structure`` there is no
-    ``ssim``, which takes longer than all others together.
+    Masks and skeletons are taken at 0.5. ``ssim`` takes longer than all others together.
     """
+    _same_shape(truth, predicted)
     if predicted is not None and not np.isfinite(predicted).all():
         predicted = None
-    best, threshold = best_dice(truth, predicted)
     mask_truth = truth >= VOLUME_THRESHOLD
     mask_predicted = None if predicted is None else predicted >= VOLUME_THRESHOLD
     s_truth = skeleton(mask_truth, spacing_mm)
     s_predicted = None if mask_predicted is None else skeleton(mask_predicted, spacing_mm)
-    found = {
-        "dsc": volume_dice(truth, predicted),
-        "best_dsc": best,
-        "best_threshold": Measure(threshold, best.reason),
-        "ot_1mm": overlap_within(s_truth, s_predicted, 1.0),
-        "ot_2mm": overlap_within(s_truth, s_predicted, 2.0),
-        "chamfer_mm": chamfer_mm(s_truth, s_predicted),
-        "cldice": cl_dice(mask_truth, mask_predicted, s_truth, s_predicted),
+
+    best = functools.cache(lambda: best_dice(truth, predicted))
+    makers = {
+        "dsc": lambda: dice(mask_truth, mask_predicted),
+        "best_dsc": lambda: best()[0],
+        "best_threshold": lambda: Measure(best()[1], best()[0].reason),
+        "ot_1mm": lambda: overlap_within(s_truth, s_predicted, 1.0),
+        "ot_2mm": lambda: overlap_within(s_truth, s_predicted, 2.0),
+        "chamfer_mm": lambda: chamfer_mm(s_truth, s_predicted),
+        "cldice": lambda: cl_dice(mask_truth, mask_predicted, s_truth, s_predicted),
+        "ssim": lambda: ssim(truth, predicted),
     }
-    return {**found, "ssim": ssim(truth, predicted)} if structure else found
+    return {name: makers[name]() for name in names}
 
 
 def projection_measures(truth_mm: Array, predicted_mm: Array | None) -> dict[str, Measure]:
