@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from gcar_deploy.output.scratch import FRESH, OLD, scratch_folder, sweep
 _AT_FDCWD = -100
 _RENAME_NOREPLACE = 1
 _RENAME_EXCHANGE = 2
-
+#: files written at once
+_WRITERS = 8
 
 #: the file that lists all others of a folder; the first is what ``gcar run`` writes anyway
 MANIFESTS = ("result.json", "manifest.json")
@@ -144,8 +146,9 @@ def write_folder(out_dir: Path, files: Mapping[str, bytes], *, force: bool = Fal
         with _parents(out_dir), scratch_folder(out_dir.absolute().parent) as scratch:
             fresh = scratch / FRESH
             fresh.mkdir()
-            for name, data in files.items():
-                _write(fresh / name, data)
+            # Each file waits for the disk; together they wait once.
+            with ThreadPoolExecutor(_WRITERS, "gcar-write") as pool:
+                list(pool.map(lambda name: _write(fresh / name, files[name]), files))
             _sync_folder(fresh)
             _put(fresh, out_dir, scratch / OLD, force=force)
             _sync_folder(out_dir.absolute().parent)
