@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,8 @@ class Session:
 
     Parameters
     ----------
-    model : ModelFile, as ``read_model`` returns it; its golden case, if any, is run at once,
-        unless it is pinned
+    model : ModelFile, as ``read_model`` returns it; it is opened, and its golden case, if any, is
+        run, at once; a pinned one opens in the background
     inputs : names of the graph's inputs that the caller will give
     threads : int, within one inference; spinning is off, so idle threads cost nothing
     arena : bool, keep the memory of an inference for the next one: a quarter faster
@@ -34,7 +35,8 @@ class Session:
     Raises
     ------
     ModelError
-        The model does not load, wants other inputs, or fails its golden case.
+        The model does not load, wants other inputs, or fails its golden case; of a pinned model
+        that is told when it is first run.
     """
 
     def __init__(
@@ -47,14 +49,19 @@ class Session:
         runtime: Any = None,
     ) -> None:
         self.model = model
+        self._given = runtime
         if runtime is None:
-            runtime = _open(model, threads, arena)
-            found = [node.name for node in runtime.get_inputs()]
-            if sorted(found) != sorted(inputs) or not runtime.get_outputs():
-                raise ModelError(f"model {model.name} has other inputs than this version gives")
-        self._runtime = runtime
+            # Opening holds no Python: the caller goes on, and waits at the first question.
+            pool = ThreadPoolExecutor(1, "gcar-open")
+            self._opened = pool.submit(_open, model, inputs, threads, arena)
+            pool.shutdown(wait=False)
         if not model.pinned:
+            _ = self._runtime
             self.check_golden()
+
+    @property
+    def _runtime(self) -> Any:
+        return self._opened.result() if self._given is None else self._given
 
     def check_golden(self) -> float | None:
         """Run the model's golden case again; return the largest difference, None without one.
@@ -116,8 +123,9 @@ class Session:
     def _run(
         self, outputs: Sequence[str] | None, feed: Mapping[str, Array], options: Any = None
     ) -> list[Array]:
+        runtime = self._runtime
         try:
-            found: list[Array] = self._runtime.run(outputs, dict(feed), options)
+            found: list[Array] = runtime.run(outputs, dict(feed), options)
         except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
             if getattr(options, "terminate", False):
                 raise CancelledError("cancelled while the model ran") from None
@@ -125,7 +133,9 @@ class Session:
         return found
 
 
-def _open(model: ModelFile, threads: int, arena: bool) -> ort.InferenceSession:
+def _open(
+    model: ModelFile, inputs: Sequence[str], threads: int, arena: bool
+) -> ort.InferenceSession:
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -136,9 +146,13 @@ def _open(model: ModelFile, threads: int, arena: bool) -> ort.InferenceSession:
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return ort.InferenceSession(model.data, options, providers=["CPUExecutionProvider"])
+        opened = ort.InferenceSession(model.data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
         raise ModelError(f"model {model.name} does not load: {_first_line(error)}") from None
+    found = [node.name for node in opened.get_inputs()]
+    if sorted(found) != sorted(inputs) or not opened.get_outputs():
+        raise ModelError(f"model {model.name} has other inputs than this version gives")
+    return opened
 
 
 @contextlib.contextmanager

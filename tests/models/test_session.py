@@ -165,3 +165,26 @@ def test_inputs_are_the_graphs_own():
         Session(read_predictor(TINY), ["picture"])
     with pytest.raises(ModelError, match="model tiny fails: "):
         Session(read_predictor(TINY), input_names()).run({}, [(1, 5)])
+
+
+def test_a_pinned_model_opens_while_the_caller_goes_on(monkeypatch):
+    asked, open_ = threading.Event(), session_module._open
+
+    def late(*args):
+        assert asked.wait(20.0)
+        return open_(*args)
+
+    monkeypatch.setattr(session_module, "_open", late)
+    pinned = dataclasses.replace(read_predictor(TINY), pinned=True)
+    opening = Session(pinned, input_names())  # would wait for ever
+    asked.set()
+    assert opening.check_golden() < 1e-3
+
+
+def test_a_pinned_model_that_does_not_open_says_so_when_it_is_run():
+    broken = dataclasses.replace(read_predictor(TINY), pinned=True, data=b"no graph")
+    opening = Session(broken, input_names())
+    with pytest.raises(ModelError, match="^model tiny does not load"):
+        opening.run({}, [(1, 5)])
+    with pytest.raises(ModelError, match="model tiny does not load"):
+        Session(dataclasses.replace(broken, pinned=False, golden=None), input_names())
