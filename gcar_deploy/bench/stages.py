@@ -7,6 +7,7 @@ the operating system has read the files before (the first run is not counted).
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -61,8 +62,8 @@ def stage_seconds(
 
     Returns
     -------
-    cold, warm : stage to median seconds; cold also ``imports``, ``model`` (load, check, golden
-        case of a model from elsewhere), ``files`` (the result folder), ``whole process``
+    cold, warm : stage to median seconds; cold also ``imports``, ``model`` (read, check; the
+        shipped one opens beside what follows), ``files`` (the result folder), ``whole process``
         (``gcar run``), beside it ``LIBRARIES``, and ``PEAK`` where the system tells it
 
     Raises
@@ -126,9 +127,12 @@ def _cold(threads: int | None) -> dict[str, float]:
 
 
 def _process(arguments: list[str]) -> str:
+    # The first run, which does not count, leaves the bytecode that an installation comes with.
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     done = subprocess.run(  # noqa: S603 - our own interpreter and package
-        [sys.executable, *arguments], capture_output=True, text=True, timeout=_MOST_S, check=False
-    )
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=_MOST_S, check=False,
+        env=environment,
+    )  # fmt: skip
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise GcarError(f"a process that was to be timed failed: {last}")

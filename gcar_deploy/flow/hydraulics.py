@@ -44,7 +44,8 @@ def piece_resistance(radius_mm: Array, length_mm: Scalars, viscosity_pa_s: float
     (..., m - 1) Pa s / m^3
     """
     a, b = radius_mm[..., :-1] * _MM, radius_mm[..., 1:] * _MM
-    cone = (a * a + a * b + b * b) / (3.0 * (a * b) ** 3)
+    ab = a * b
+    cone = (a * a + ab + b * b) / (3.0 * ab * ab * ab)  # a power would take five times as long
     out: Array = 8.0 * viscosity_pa_s / np.pi * length_mm * _MM * cone
     return out
 

@@ -126,9 +126,13 @@ def information_from(
 
 def worst_across(information: Array) -> Scalars:
     """(...) standard deviation in the worse direction across a vessel, mm; see ``curve_sigmas``."""
-    # Only the plane across the vessel counts: along T the information is nil by construction.
-    values = np.linalg.eigvalsh(information)
-    low, high = values[..., 1], values[..., 2]
+    # Only the plane across the vessel counts: along T the information is nil by construction. Of
+    # the other two eigenvalues the trace is the sum, the principal minors add up to the product.
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = np.moveaxis(information, (-2, -1), (0, 1))
+    total = xx + yy + zz
+    product = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
+    high = 0.5 * (total + np.sqrt(np.maximum(total * total - 4.0 * product, 0.0)))
+    low = product / np.maximum(high, 1e-300)
     with np.errstate(divide="ignore"):
         out: Scalars = np.where(
             low > RELATIVE_CUTOFF * high, 1.0 / np.sqrt(np.maximum(low, 1e-300)), np.inf

@@ -14,7 +14,6 @@ from gcar_deploy.errors import GeometryError, ModelError
 from gcar_deploy.files import read_bounded
 from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.models.golden import Golden, read_golden
-from gcar_deploy.models.guard import check_onnx
 
 SCHEMA = "gcar-model/1"
 _MAX_SPEC_BYTES = 64 * 2**10
@@ -139,6 +138,8 @@ def check_graph(name: str, data: bytes, limits: ModelLimits | None = None) -> No
     ------
     ModelError
     """
+    from gcar_deploy.models.guard import check_onnx
+
     try:
         check_onnx(data, limits or ModelLimits())
     except ValueError as error:

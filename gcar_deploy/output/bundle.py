@@ -9,8 +9,6 @@ from pathlib import Path
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output.folder import listed, write_folder
-from gcar_deploy.output.frame_pictures import frame_png
-from gcar_deploy.output.glb import glb_bytes
 from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
 from gcar_deploy.output.tables import (
@@ -57,6 +55,8 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         "surface.stl": lambda: stl_bytes(surface),
     }
     if "glb" in extras:
+        from gcar_deploy.output.glb import glb_bytes
+
         makers[EXTRAS["glb"]] = lambda: glb_bytes(surface)
     if "dicom-stl" in extras:
         from gcar_deploy.output.dicom_stl import dicom_stl_bytes
@@ -77,6 +77,8 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         files[f"overlay_view{number}.png"] = png_bytes(picture)
     for number, angiogram in enumerate(result.angiograms, start=1):
         if angiogram.frame is not None:
+            from gcar_deploy.output.frame_pictures import frame_png
+
             files[f"frame_view{number}.png"] = frame_png(angiogram)
     summary = result.summary()
     pictures = [dimmed.picture for dimmed in behind]

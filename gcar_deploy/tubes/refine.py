@@ -13,7 +13,6 @@ from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import NumericalError, UsageError
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.gaussians import Gaussians
-from gcar_deploy.gaussians.paper import initial_gaussians, refine_paper
 from gcar_deploy.gaussians.voxelize import points_of, voxelize
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
@@ -163,6 +162,8 @@ def refine(
     budget = budget or Budget()
     placed = centers
     if centers.source == "paper":
+        from gcar_deploy.gaussians.paper import initial_gaussians
+
         # Centres of single views stand anywhere; trees are made on a lattice.
         spread = initial_gaussians(centers, options.paper)
         centers = points_of(spread, min(centers.spacing_mm, LARGEST_CELL_MM))
@@ -257,6 +258,8 @@ def _paper(
     on_progress: OnProgress | None,
     should_stop: Callable[[], bool] | None,
 ) -> Refined:
+    from gcar_deploy.gaussians.paper import refine_paper
+
     out = refine_paper(
         centers, views, options.paper, on_progress=on_progress, should_stop=should_stop
     )

@@ -12,6 +12,7 @@ from gcar_deploy.geometry.observability import (
     geometry_sigmas,
     point_sigmas,
     rmse_two_views,
+    worst_across,
 )
 
 
@@ -90,6 +91,21 @@ def test_vessel_in_the_epipolar_plane_and_along_the_beam():
         Observability.NONE,
         Observability.NONE,
     ]
+
+
+def test_the_worse_direction_is_an_eigenvalue():
+    """Two measurements across each of 200 vessels; of 20 vessels the same one twice."""
+    rng = np.random.default_rng(4)
+    T = rng.normal(size=(200, 3))
+    m = np.cross(T, rng.normal(size=(2, 200, 3)))
+    m[1, :20] = m[0, :20]
+    m[1, 20:40] = m[0, 20:40] + 0.1 * m[1, 20:40]
+    information = np.einsum("vni,vnj->nij", m, m)
+    found = worst_across(information)
+    assert np.isinf(found[:20]).all()
+    np.testing.assert_allclose(
+        found[20:], np.linalg.eigvalsh(information[20:])[:, 1] ** -0.5, rtol=1e-6
+    )
 
 
 def test_curve_bound_is_the_closed_form():

@@ -184,7 +184,7 @@ def test_a_pinned_model_opens_while_the_caller_goes_on(monkeypatch):
 def test_a_pinned_model_that_does_not_open_says_so_when_it_is_run():
     broken = dataclasses.replace(read_predictor(TINY), pinned=True, data=b"no graph")
     opening = Session(broken, input_names())
-    with pytest.raises(ModelError, match="^model tiny does not load"):
+    with pytest.raises(ModelError, match=r"^model tiny does not load"):
         opening.run({}, [(1, 5)])
     with pytest.raises(ModelError, match="model tiny does not load"):
         Session(dataclasses.replace(broken, pinned=False, golden=None), input_names())
