@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output.folder import listed, write_folder
-from gcar_deploy.output.overlay import backdrop, overlay, png_bytes
+from gcar_deploy.output.overlay import Backdrop, backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
 from gcar_deploy.output.tables import (
     centerline_csv,
@@ -22,6 +23,8 @@ from gcar_deploy.output.volume import nifti_bytes
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 
+#: threads beside the one that makes the tables
+_WORKERS = 2
 RESULT_NAME = "result.json"
 #: lattice of the lumen surface: finer than a section every 0.8 mm, and still a few megabytes
 SURFACE_EDGE_MM = 0.4
@@ -44,48 +47,53 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         An extra is unknown, or needs a library that is not installed.
     """
     check_extras(extras)
-    surface, ghosts = lumen_surface(result.tree, SURFACE_EDGE_MM), result.ghost_probability
-    makers: dict[str, Callable[[], bytes]] = {
-        "volume.nii.gz": lambda: nifti_bytes(result.volume, result.grid),
-        "gaussians.npz": lambda: gaussians_npz(result.gaussians),
-        "gaussians.ply": lambda: gaussians_ply(result.gaussians),
-        "centerline.vtp": lambda: centerline_vtp(result.tree, result.measured, ghosts),
-        "centerline.csv": lambda: centerline_csv(result.tree, result.measured, ghosts),
-        "diameters.csv": lambda: diameters_csv(result.lumen, result.measured),
-        "surface.stl": lambda: stl_bytes(surface),
-    }
+    with ThreadPoolExecutor(_WORKERS, "gcar-render") as pool:
+        # What works long outside Python goes beside the tables.
+        meshed = pool.submit(lumen_surface, result.tree, SURFACE_EDGE_MM)
+        drawn = [pool.submit(_drawn, result, k) for k in range(len(result.views))]
+        occupancy = pool.submit(nifti_bytes, result.volume, result.grid)
+        ghosts = result.ghost_probability
+        tables = {
+            "gaussians.npz": gaussians_npz(result.gaussians),
+            "gaussians.ply": gaussians_ply(result.gaussians),
+            "centerline.vtp": centerline_vtp(result.tree, result.measured, ghosts),
+            "centerline.csv": centerline_csv(result.tree, result.measured, ghosts),
+            "diameters.csv": diameters_csv(result.lumen, result.measured),
+        }
+        summary = result.summary()
+        pictures = [one.result() for one in drawn]
+        surface = meshed.result()
+        files = {"volume.nii.gz": occupancy.result(), **tables, "surface.stl": stl_bytes(surface)}
     if "glb" in extras:
         from gcar_deploy.output.glb import glb_bytes
 
-        makers[EXTRAS["glb"]] = lambda: glb_bytes(surface)
+        files[EXTRAS["glb"]] = glb_bytes(surface)
     if "dicom-stl" in extras:
         from gcar_deploy.output.dicom_stl import dicom_stl_bytes
 
-        makers[EXTRAS["dicom-stl"]] = lambda: dicom_stl_bytes(
-            stl_bytes(surface), [angiogram.sha256 for angiogram in result.angiograms]
+        files[EXTRAS["dicom-stl"]] = dicom_stl_bytes(
+            files["surface.stl"], [angiogram.sha256 for angiogram in result.angiograms]
         )
-    files = {name: make() for name, make in makers.items()}
-    behind = [
-        backdrop(angiogram.pixels, missing, view.catheter)
-        for angiogram, missing, view in zip(
-            result.angiograms, result.unexplained, result.views, strict=True
-        )
-    ]
-    drawn = zip(behind, result.views, result.quality.views, strict=True)
-    for number, (dimmed, view, judged) in enumerate(drawn, start=1):
-        picture = overlay(dimmed, view, result.tree, judged, ghosts)
-        files[f"overlay_view{number}.png"] = png_bytes(picture)
+    for number, (_, encoded) in enumerate(pictures, start=1):
+        files[f"overlay_view{number}.png"] = encoded
     for number, angiogram in enumerate(result.angiograms, start=1):
         if angiogram.frame is not None:
             from gcar_deploy.output.frame_pictures import frame_png
 
             files[f"frame_view{number}.png"] = frame_png(angiogram)
-    summary = result.summary()
-    pictures = [dimmed.picture for dimmed in behind]
-    files["report.html"] = report_html(result, summary, pictures).encode("utf-8")
+    page = report_html(result, summary, [behind.picture for behind, _ in pictures])
+    files["report.html"] = page.encode("utf-8")
     summary["files"] = listed(files)
     files[RESULT_NAME] = (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode("utf-8")
     return files
+
+
+def _drawn(result: Reconstruction, k: int) -> tuple[Backdrop, bytes]:
+    """Draw view k; return what lies behind the tree, and the whole as PNG."""
+    angiogram, view = result.angiograms[k], result.views[k]
+    behind = backdrop(angiogram.pixels, result.unexplained[k], view.catheter)
+    picture = overlay(behind, view, result.tree, result.quality.views[k], result.ghost_probability)
+    return behind, png_bytes(picture)
 
 
 def check_extras(extras: Sequence[str]) -> None:
