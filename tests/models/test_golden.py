@@ -63,7 +63,7 @@ def test_a_shipped_model_is_checked_by_its_hash_alone(tmp_path, monkeypatch):
     shipped, none = SEGMENTER.path, ModelLimits(max_nodes=1)
     assert shipped is not None
     with monkeypatch.context() as patch:
-        patch.setattr("gcar_deploy.models.spec.check_onnx", lambda *_: pytest.fail("walked"))
+        patch.setattr("gcar_deploy.models.guard.check_onnx", lambda *_: pytest.fail("walked"))
         found = read_model(shipped, KINDS)
     assert found.pinned
     assert found.golden is not None
