@@ -47,9 +47,8 @@ class QualityOptions:
     #: views of one tree. By the rule of ``gcar-export gate-table``
     good_disagreement_mask: Gate = 0.25
     max_disagreement_mask: Gate = 0.6
-    #: above this the largest part of each picture is asked alone: what else was found may be
-    #: background. 0.1 to 0.28 would cost a little less on the first seed
-    parts_disagreement_raw: Gate = 0.35
+    #: above this lines that no other view shows are left out of raw pictures
+    parts_disagreement_raw: Gate = 0.1
     #: two pictures that disagree less with each other's geometry than this multiple of their own
     #: disagreement: nobody can say that they are not swapped. Without it 5, 7 and 1 swapped raw
     #: pairs of 24, 24 and 10 would be ``ok``; it takes ``ok`` from 0, 0 and 1 pairs of one tree

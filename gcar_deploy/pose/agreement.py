@@ -12,12 +12,12 @@ import numpy as np
 from gcar_deploy.config import PoseOptions, RunOptions
 from gcar_deploy.geometry.consistency import Mass, disagreement, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
+from gcar_deploy.pose.partners import partnered
 from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
@@ -29,40 +29,36 @@ def agreeing(
     """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
 
     First from what the network alone sees, where the classical method followed lines that have no
-    counterpart; then from the largest part of each.
-
-    What was taken for vessel in one picture's background stands apart from the tree as a rule and
-    has no counterpart in the other picture. Parts of a mask that the user gave are never dropped.
+    counterpart; then without lines that no other view shows (``partners``). Nothing of a mask that
+    the user gave is left out.
 
     Returns
     -------
-    views : as given, what the network alone sees of them, or their largest connected parts
+    views : as given, what the network alone sees of them, or without some of their lines
     poses : one per view
-    findings : that parts were left out, which makes the result ``degraded``
+    findings : that lines were left out, which makes the result ``degraded``
     """
-    limits = options.quality
     views, poses = _alone_if_closer(views, options)
-    worst = max(p.after for p in poses)
-    if all(v.calibrated for v in views) or worst <= limits.parts_disagreement_raw:
-        return list(views), poses, []
-    main = [
-        view
-        if view.calibrated or view.kind == "mask" or angiogram.mask is not None
-        else largest_part(view)
+    asked = [
+        not (view.calibrated or view.kind == "mask" or angiogram.mask is not None)
         for angiogram, view in zip(angiograms, views, strict=True)
     ]
-    if all(a is b for a, b in zip(main, views, strict=True)):
-        return list(views), poses, []
-    closer = poses_between(main, options)
-    if max(p.after for p in closer) > limits.good_disagreement_raw:
+    enough = options.quality.parts_disagreement_raw
+
+    def estimate(tried: Sequence[VesselImage]) -> tuple[Pose, ...]:
+        return poses_between(tried, options)
+
+    fewer, closer = partnered(views, poses, asked, enough, estimate)
+    # What still contradicts is another tree: it is not trimmed to fit.
+    if max(p.after for p in closer) > options.quality.good_disagreement_raw:
         return list(views), poses, []
     findings = [
         f"view {one.view_id}: {1 - one.mask.sum() / view.mask.sum():.0%} of what looks like vessel "
-        "stands apart and has no counterpart in the other views: left out as background"
-        for one, view in zip(main, views, strict=True)
+        "has no counterpart in the other views: left out as catheter, lead or background"
+        for one, view in zip(fewer, views, strict=True)
         if one is not view
     ]
-    return main, closer, findings
+    return fewer, closer, findings
 
 
 def _alone_if_closer(

@@ -1,0 +1,110 @@
+"""Lines of a raw picture that may be something else than vessel, for the views to decide.
+
+A catheter comes from the border of the field and goes on straight where it crosses a vessel; a
+lead, a rib or a wire often stands apart from the tree. A vessel may do either, so nothing of the
+picture alone says which it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.linegraph import LineGraph, Pixel
+from gcar_deploy.types import Mask
+
+#: so near to the border of the field a line comes from outside, mm
+BORDER_MM = 4.0
+#: side branches shorter than this are spurs; lines shorter than this move nothing; longest, mm
+SPUR_MM, SHORTEST_MM, LONGEST_MM = 6.0, 8.0, 160.0
+#: a line goes on through a fork where it turns by no more than this over so much of its way
+THROUGH_DEG, _WAY_MM = 25.0, 4.0
+
+
+def stray_lines(view: VesselImage) -> Iterator[Mask]:
+    """Yield (rows, cols) bool parts of the view's skeleton that may be no vessel.
+
+    Parts beside the largest; what comes from the border, to its first fork; and the same line on
+    through forks as long as it goes straight.
+    """
+    line = view.skeleton
+    px = 1.0 / view.carm.pixel_at_isocenter_mm
+    count, label = cv2.connectedComponents(line.astype(np.uint8), connectivity=8)
+    size = np.bincount(label[line], minlength=count)
+    yield from (label == k for k in range(1, count)
+                if k != size.argmax() and size[k] >= SHORTEST_MM * px)  # fmt: skip
+    graph = LineGraph(line)
+    framed = cv2.copyMakeBorder(
+        view.valid.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0
+    )
+    inward = cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    for end in graph.ends(line & (inward <= BORDER_MM * px)):
+        path, spurs = graph.walk(end, SPUR_MM * px, LONGEST_MM * px)
+        if len(path) >= SHORTEST_MM * px:
+            yield _drawn(line, [*path, *spurs])
+        further = _straight_on(graph, path, px)
+        if len(further) >= len(path) + SHORTEST_MM * px:
+            yield _drawn(line, further)
+
+
+def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:
+    """Return the view without a part of its skeleton and what lies along it; None if all goes."""
+    line = view.skeleton
+    left = line & ~stray
+    if not left.any():
+        return None
+    reach = view.path_mm > 0
+    gone = skel.beside(reach, line, stray) & ~skel.beside(reach, line, left)
+    mask = view.mask & ~gone
+    device = gone & view.mask if view.catheter is None else view.catheter | (gone & view.mask)
+    return dataclasses.replace(
+        view, others=(), mask=mask, skeleton=skel.skeletonize(mask), catheter=device,
+        path_mm=np.where(gone, np.float32(0), view.path_mm),
+    )  # fmt: skip
+
+
+def _straight_on(graph: LineGraph, path: list[Pixel], px: float) -> list[Pixel]:
+    """Go on from the last pixel of a path through forks, as long as there is a straight way."""
+    path, seen = list(path), set(path)
+    way = max(3, round(_WAY_MM * px))
+    while len(path) < LONGEST_MM * px:
+        here = path[-1]
+        before = np.subtract(here, path[-way] if len(path) >= way else path[0])
+        ahead = [(_cosine(before, np.subtract(_reached(graph, seen, here, p, way), here)), p)
+                 for p in graph.joined(here) if p not in seen]  # fmt: skip
+        if not ahead:
+            break
+        straightest, pixel = max(ahead)
+        if len(ahead) > 1 and straightest < math.cos(math.radians(THROUGH_DEG)):
+            break
+        path.append(pixel)
+        seen.add(pixel)
+    return path
+
+
+def _reached(graph: LineGraph, seen: set[Pixel], here: Pixel, first: Pixel, steps: int) -> Pixel:
+    """Where so many steps from ``here`` by way of ``first`` lead, as far away as they can."""
+    trod, at = {*seen, first}, first
+    for _ in range(steps - 1):
+        onward = [p for p in graph.joined(at) if p not in trod]
+        if not onward:
+            break
+        at = max(onward, key=lambda p: (math.dist(p, here), p))
+        trod.add(at)
+    return at
+
+
+def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a @ b) / max(float(np.hypot(*a) * np.hypot(*b)), 1e-9)
+
+
+def _drawn(line: Mask, pixels: list[Pixel]) -> Mask:
+    out = np.zeros_like(line)
+    out[tuple(np.transpose(pixels))] = True
+    return out

@@ -1,0 +1,83 @@
+"""Lines of raw pictures that the other views do not show: catheters, leads, background.
+
+Two views of one tree hold the same vessel mass in every epipolar plane. A line that one view alone
+shows breaks that. So of the lines that may be no vessel (``imaging.stray_lines``) those are left
+out without which the views agree far better: one, or one in each of two views, again and again.
+Catheters that both views show agree as vessels do; they are for the segmentation to tell.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.stray_lines import stray_lines, without_line
+from gcar_deploy.pose.pairwise import Pose
+
+#: each line that is left out lowers the disagreement to this share at least
+GAIN = 0.85
+#: at least this share of a view's line stays
+KEPT_SHARE = 0.5
+#: of a view's lines the longest are asked
+MOST_LINES = 8
+
+
+def partnered(
+    views: Sequence[VesselImage], poses: tuple[Pose, ...], asked: Sequence[bool], enough: float,
+    estimate: Callable[[Sequence[VesselImage]], tuple[Pose, ...]],
+) -> tuple[list[VesselImage], tuple[Pose, ...]]:  # fmt: skip
+    """Leave out lines that no other view shows, until the views agree well enough.
+
+    Parameters
+    ----------
+    views : V vessel images
+    poses : what ``estimate`` says of them
+    asked : of each view whether its lines may be left out
+    enough : disagreement, 0 .. 1, from which on nothing more is asked
+    estimate : poses of such views
+
+    Returns
+    -------
+    views, poses : those that are not changed are the same objects
+    """
+    now = list(views)
+    least = [KEPT_SHARE * view.skeleton.sum() for view in views]
+    while (worst := max(pose.after for pose in poses)) > enough:
+        fewer = [
+            list(_reduced(view, few)) if may else []
+            for view, few, may in zip(now, least, asked, strict=True)
+        ]
+        best: tuple[float, list[VesselImage], tuple[Pose, ...]] | None = None
+        for tried in _trials(now, fewer):
+            gone = sum(a is not b for a, b in zip(tried, now, strict=True))
+            found = estimate(tried)
+            cost = max(pose.after for pose in found) / GAIN**gone
+            if cost <= worst and (best is None or cost < best[0]):
+                best = cost, tried, found
+        if best is None:
+            break
+        _, now, poses = best
+    return now, poses
+
+
+def _reduced(view: VesselImage, least_px: float) -> Iterator[VesselImage]:
+    lines = sorted(stray_lines(view), key=lambda line: -int(line.sum()))[:MOST_LINES]
+    for line in lines:
+        left = without_line(view, line)
+        if left is not None and left.skeleton.sum() >= least_px:
+            yield left
+
+
+def _trials(
+    now: Sequence[VesselImage], fewer: Sequence[Sequence[VesselImage]]
+) -> Iterator[list[VesselImage]]:
+    """Yield the views with one line less in one of them, and in each of two."""
+    for k, reduced in enumerate(fewer):
+        for one in reduced:
+            yield [*now[:k], one, *now[k + 1 :]]
+    for j, k in itertools.combinations(range(len(now)), 2):
+        for a, b in itertools.product(fewer[j], fewer[k]):
+            out = list(now)
+            out[j], out[k] = a, b
+            yield out
