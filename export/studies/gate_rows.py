@@ -23,7 +23,6 @@ from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.net import Segmenter, load_segmenter
-from gcar_deploy.imaging.parts import largest_part
 from gcar_deploy.measure.metrics import volume_dice
 from gcar_deploy.pose import agreement
 from gcar_deploy.quality import GHOST_MM
@@ -43,7 +42,7 @@ from gcar_export.studies.pose_table import aligned, chamfer_mm
 
 #: volume DSC from which on a tree has come out
 CAME_OUT = 0.5
-#: raw pairs are reconstructed from their largest parts as well where they disagree by more
+#: raw pairs are reconstructed without unpartnered lines as well where they disagree by more
 PARTS_FROM = 0.1
 #: finds the tree that pairs show by its side, and by whether as the common protocol places it
 Maker = Callable[[str, bool], Subject]
@@ -92,7 +91,7 @@ class Row:
     contrast, background, photons : of raw pictures, else None
     spoilt : whether masks have a segmentation's faults
     whole : from all that was found in the pictures
-    parts : from the largest part of each, None where that was not asked
+    parts : without lines that the other view does not show, None where that was not asked
     other_order : disagreement of the pictures with each other's geometry, None where a picture
         shows no vessel
     """
@@ -193,7 +192,7 @@ def _anywhere(maker: Callable[[str], Subject]) -> Maker:
 
 
 def open_engines() -> dict[str, Engine]:
-    """Return engines that take the ``whole`` pictures and their largest ``parts``, gates open."""
+    """Return engines, gates open, that take ``whole`` pictures and the ``parts`` both show."""
     return {name: Engine(threads=1, options=_open(name)) for name in ("whole", "parts")}
 
 
@@ -280,7 +279,7 @@ def _refused(pair: Pair, engine: Engine, reason: str) -> Attempt:
     except RefusedError:
         return Attempt(disagreement=1.0, shift_mm=0.0, turn_deg=0.0, refused=reason)
     if engine.options.quality.parts_disagreement_raw < 0:
-        views = [largest_part(view) for view in views]
+        views = agreement.agreeing(pair.angiograms, views, engine.options)[0]
     pose = agreement.poses_between(views, engine.options)[1]
     return Attempt(
         disagreement=pose.after, shift_mm=pose.shift_mm, turn_deg=pose.turn_deg, refused=reason

@@ -41,7 +41,7 @@ COST_TRUE = {OK: 0.0, DEGRADED: 0.25, REFUSED: 1.0}
 COST_WRONG = {OK: 3.0, DEGRADED: 0.5, REFUSED: 0.0}
 #: gates that change the sum by less are left as they are
 LEAST_GAIN = 0.04
-#: gate -> values that are tried. Raw pairs are reconstructed from their largest parts as well
+#: gate -> values that are tried. Raw pairs are reconstructed without unpartnered lines as well
 #: where these agree better than the whole, which disagrees by more than the least value here.
 GATES: dict[str, tuple[float, ...]] = {
     name: tuple(np.round(np.arange(low, high, step), 3).tolist())

@@ -2,13 +2,12 @@
 
 Two views of one tree hold the same vessel mass in every epipolar plane. A line that one view alone
 shows breaks that. So of the lines that may be no vessel (``imaging.stray_lines``) those are left
-out without which the views agree far better: one, or one in each of two views, again and again.
-Catheters that both views show agree as vessels do; they are for the segmentation to tell.
+out, one after the other, without which the views agree far better. Catheters that both views show
+agree as vessels do; they are for the segmentation to tell.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 
 from gcar_deploy.imaging.angiogram import VesselImage
@@ -44,20 +43,20 @@ def partnered(
     now = list(views)
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
     while (worst := max(pose.after for pose in poses)) > enough:
-        fewer = [
-            list(_reduced(view, few)) if may else []
-            for view, few, may in zip(now, least, asked, strict=True)
+        tried = [
+            [*now[:k], fewer, *now[k + 1 :]]
+            for k, (view, few, may) in enumerate(zip(now, least, asked, strict=True))
+            if may
+            for fewer in _reduced(view, few)
         ]
-        best: tuple[float, list[VesselImage], tuple[Pose, ...]] | None = None
-        for tried in _trials(now, fewer):
-            gone = sum(a is not b for a, b in zip(tried, now, strict=True))
-            found = estimate(tried)
-            cost = max(pose.after for pose in found) / GAIN**gone
-            if cost <= worst and (best is None or cost < best[0]):
-                best = cost, tried, found
-        if best is None:
+        if not tried:
             break
-        _, now, poses = best
+        found = [estimate(views) for views in tried]
+        after = [max(pose.after for pose in poses) for poses in found]
+        best = after.index(min(after))
+        if after[best] > GAIN * worst:
+            break
+        now, poses = tried[best], found[best]
     return now, poses
 
 
@@ -67,17 +66,3 @@ def _reduced(view: VesselImage, least_px: float) -> Iterator[VesselImage]:
         left = without_line(view, line)
         if left is not None and left.skeleton.sum() >= least_px:
             yield left
-
-
-def _trials(
-    now: Sequence[VesselImage], fewer: Sequence[Sequence[VesselImage]]
-) -> Iterator[list[VesselImage]]:
-    """Yield the views with one line less in one of them, and in each of two."""
-    for k, reduced in enumerate(fewer):
-        for one in reduced:
-            yield [*now[:k], one, *now[k + 1 :]]
-    for j, k in itertools.combinations(range(len(now)), 2):
-        for a, b in itertools.product(fewer[j], fewer[k]):
-            out = list(now)
-            out[j], out[k] = a, b
-            yield out

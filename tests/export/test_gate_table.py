@@ -174,7 +174,7 @@ def test_statuses(changes, status):
 
 
 def test_parts_are_taken_as_the_engine_takes_them():
-    whole = row(disagreement=GATES.parts_disagreement_raw + 0.05, coverage=0.5)
+    whole = row(disagreement=GATES.good_disagreement_raw + 0.2, coverage=0.5)
     parts = row(disagreement=0.1, findings=("left out",)).whole
     assert replayed(whole, GATES) == "refused"
     assert replayed(dataclasses.replace(whole, parts=parts), GATES) == "degraded"

@@ -1,0 +1,73 @@
+"""Which lines of a picture may be something else than vessel, and what is left without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.skeleton import skeletonize
+from gcar_deploy.imaging.stray_lines import stray_lines, without_line
+from gcar_deploy.types import Mask
+from tests.imaging.phantoms import PIXEL_MM, carm
+
+SIDE = 240
+
+
+def view_of(*strokes: tuple[slice, slice]) -> VesselImage:
+    mask = np.zeros((SIDE, SIDE), bool)
+    for rows, columns in strokes:
+        mask[rows, columns] = True
+    return VesselImage(
+        view_id="1", carm=carm(SIDE, SIDE), path_mm=mask.astype(np.float32), path_error=0.25,
+        mask=mask, skeleton=skeletonize(mask), valid=np.ones(mask.shape, bool), kind="raw",
+    )  # fmt: skip
+
+
+#: strokes 5 pixels wide: a vessel upright in the middle, a line that comes from the left border and
+#: crosses it, a branch that ends in the field, and a short bar apart from all
+MIDDLE = SIDE // 2
+VESSEL = slice(30, SIDE - 30), slice(MIDDLE - 2, MIDDLE + 3)
+CROSSING = slice(60, 65), slice(0, SIDE - 40)
+BRANCH = slice(SIDE - 65, SIDE - 60), slice(MIDDLE, SIDE - 40)
+APART = slice(SIDE - 45, SIDE - 40), slice(40, 40 + round(12 / PIXEL_MM))
+
+
+def covers(line: Mask, stroke: tuple[slice, slice]) -> float:
+    """Share of a stroke's columns that a line runs through."""
+    inside = line[stroke].any(axis=0)
+    return float(inside.mean())
+
+
+def test_what_comes_from_the_border_goes_on_straight_through_the_vessel() -> None:
+    view = view_of(VESSEL, CROSSING)
+    lines = list(stray_lines(view))
+    assert len(lines) == 2
+    short, long = sorted(lines, key=np.sum)
+    assert not (short & ~view.skeleton).any() and not (long & ~view.skeleton).any()
+    assert covers(short, CROSSING) == pytest.approx(MIDDLE / (SIDE - 40), abs=0.03)
+    assert covers(long, CROSSING) > 0.97
+    # neither takes the vessel along
+    assert not long[90:, :].any() and not long[:50, :].any()
+
+
+def test_a_branch_that_ends_in_the_field_is_never_asked() -> None:
+    assert list(stray_lines(view_of(VESSEL, BRANCH))) == []
+
+
+def test_what_stands_apart_is_asked_unless_it_is_the_largest() -> None:
+    (line,) = stray_lines(view_of(VESSEL, APART))
+    assert covers(line, APART) > 0.8 and not line[VESSEL].any()
+
+
+def test_without_the_line_its_vessel_is_whole() -> None:
+    view = view_of(VESSEL, CROSSING)
+    line = max(stray_lines(view), key=np.sum)
+    left = without_line(view, line)
+    assert left is not None and left.catheter is not None
+    far = np.abs(np.arange(view.mask.shape[1]) - MIDDLE) > 8
+    assert not left.mask[CROSSING][:, far[: SIDE - 40]].any()
+    assert not left.path_mm[~left.mask].any()
+    assert left.mask[VESSEL].mean() > 0.95
+    assert left.catheter[62, 20] and not left.catheter[100, MIDDLE]
+    assert without_line(view, view.skeleton) is None
