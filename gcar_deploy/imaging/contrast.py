@@ -42,7 +42,8 @@ def scaled_contrast(
     c, q = rise[both].astype(np.float64), known_mm[both].astype(np.float64)
     if not c.any():
         return known_mm
-    scale = np.float32((c * q).sum() / (c * c).sum())
+    # Both are off: a regression of one on the other would make the paths too short.
+    scale = np.float32(np.sqrt((q * q).sum() / (c * c).sum()))
     path = np.where(vessel, rise * scale, np.float32(0))
     line = skel.skeletonize(vessel)
     smooth = cv2.GaussianBlur(path, (0, 0), max(_BLUR_MM / pixel_mm, _LEAST_BLUR_PX))
