@@ -9,11 +9,12 @@ from __future__ import annotations
 import dataclasses
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.types import Array, Image
+from gcar_deploy.types import Array, Image, Mask
 
 #: less than this is left of no picture, pixels: an even picture is for others to refuse
 LEAST_SIDE = 16
@@ -48,6 +49,12 @@ def _border(pixels: Image, even: Array, same: Array) -> int:
     while first < len(same) and same[first]:
         first += 1
     return first
+
+
+def inward_px(valid: Mask) -> Image:
+    """(rows, cols) float32, pixels: distance from where the picture, or its valid part, ends."""
+    framed = cv2.copyMakeBorder(valid.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    return np.asarray(cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1])
 
 
 def cut_out(angiogram: Angiogram, box: Box) -> Angiogram:

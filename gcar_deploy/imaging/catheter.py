@@ -16,6 +16,7 @@ import numpy as np
 
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
 from gcar_deploy.imaging.shaft import shaft
 from gcar_deploy.types import Image, Mask, Scalars
@@ -86,8 +87,7 @@ def catheters(
     total_mm = int(line.sum()) * pixel_mm
     if total_mm == 0:
         return found
-    framed = cv2.copyMakeBorder(valid.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    inward = cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1] * pixel_mm
+    inward = inward_px(valid) * pixel_mm
     graph = LineGraph(line)
     ends = graph.ends(line & (inward <= BORDER_MM + 0.5 * WIDEST_MM))
     if not ends:

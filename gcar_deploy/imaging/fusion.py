@@ -56,7 +56,7 @@ def _without(view: VesselImage, device: Mask | None) -> VesselImage:
     left = line & ~on_it
     if not on_it.any() or not left.any():
         return view
-    gone = skel.beside(view.path_mm > 0, line, on_it) & ~skel.beside(view.path_mm > 0, line, left)
+    gone = skel.beside_alone(view.path_mm > 0, line, on_it)
     mask = skel.parts_touching(view.mask & ~gone, left)
     return dataclasses.replace(
         view,

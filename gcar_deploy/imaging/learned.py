@@ -106,8 +106,7 @@ def shafts(seen: Seen, picture: Image, holes: Mask) -> Mask:
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / NOMINAL_MM)
     sigma_px = enhance.ridges(flat, NOMINAL_MM).sigma_px
     taken = catheters(line, flat, sigma_px, ~holes, NOMINAL_MM)
-    left = skel.beside(reach, line, line & ~taken)
-    return skel.beside(reach, line, taken) & ~left
+    return skel.beside_alone(reach, line, taken)
 
 
 def support(seen: Seen, levels: tuple[float, float]) -> Mask:

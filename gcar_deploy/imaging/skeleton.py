@@ -174,6 +174,18 @@ def beside(reach: Mask, skeleton: Mask, kept: Mask) -> Mask:
     return reach & _carried(near, skeleton, _to_line(skeleton)[1])
 
 
+def beside_alone(reach: Mask, skeleton: Mask, part: Mask) -> Mask:
+    """Pixels of ``reach`` that are ``beside`` a part of the skeleton and not beside the rest."""
+    if not part.any():
+        return np.zeros_like(reach)
+    label = _to_line(skeleton)[1]
+    near, far = (
+        _carried(cv2.dilate(own.astype(np.uint8), _BLOCK) > 0, skeleton, label)
+        for own in (part, skeleton & ~part)
+    )
+    return reach & near & ~far
+
+
 def _to_line(skeleton: Mask) -> tuple[Array, Array]:
     """(rows, cols) each: distance to the nearest skeleton pixel, and that pixel's number."""
     return cv2.distanceTransformWithLabels(

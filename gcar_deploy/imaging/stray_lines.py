@@ -16,6 +16,7 @@ import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
 from gcar_deploy.types import Mask
 
@@ -40,11 +41,7 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
     yield from (label == k for k in range(1, count)
                 if k != size.argmax() and size[k] >= SHORTEST_MM * px)  # fmt: skip
     graph = LineGraph(line)
-    framed = cv2.copyMakeBorder(
-        view.valid.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0
-    )
-    inward = cv2.distanceTransform(framed, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    for end in graph.ends(line & (inward <= BORDER_MM * px)):
+    for end in graph.ends(line & (inward_px(view.valid) <= BORDER_MM * px)):
         path, spurs = graph.walk(end, SPUR_MM * px, LONGEST_MM * px)
         if len(path) >= SHORTEST_MM * px:
             yield _drawn(line, [*path, *spurs])
@@ -60,7 +57,7 @@ def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:
     if not left.any():
         return None
     reach = view.path_mm > 0
-    gone = skel.beside(reach, line, stray) & ~skel.beside(reach, line, left)
+    gone = skel.beside_alone(reach, line, stray)
     mask = view.mask & ~gone
     device = gone & view.mask if view.catheter is None else view.catheter | (gone & view.mask)
     return dataclasses.replace(

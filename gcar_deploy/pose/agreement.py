@@ -122,11 +122,14 @@ def with_motion(
     """
     if len(views) != 2 or not options.pose.enabled or poses[1].partner:
         return tuple(poses)
+    exact = all(view.calibrated for view in views)
+    if exact and poses[1].after <= still(max(view.carm.pixel_at_isocenter_mm for view in views)):
+        return tuple(poses)
     masses, smoothing = profiled(views, options)
     fixed, moving = masses
     if fixed is None or moving is None:
         return tuple(poses)
-    if not all(view.calibrated for view in views):
+    if not exact:
         found = by_frontiers(views, poses[1], bool(options.landmarks))
         if found.motion is None and found.theta is poses[1].theta:
             return poses[0], found
@@ -135,9 +138,6 @@ def with_motion(
         )  # fmt: skip
         after = disagreement(fixed, moved, found.applied(moving.carm), smoothing.fine_mm)
         return poses[0], dataclasses.replace(found, after=after)
-    rest = still(max(view.carm.pixel_at_isocenter_mm for view in views))
-    if poses[1].after <= rest:
-        return tuple(poses)
     estimate = estimate_motion(fixed, moving, poses[1].theta, smoothing)
     if estimate is None:
         return tuple(poses)

@@ -23,7 +23,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import plane_normal, plane_slices
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.joint import corrected
-from gcar_deploy.pose.motion import DIGITS, Modes, Motion
+from gcar_deploy.pose.motion import DIGITS, Modes, Motion, pixel_size_mm, thinned
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.types import Array, Pixels, Scalars
 
@@ -51,6 +51,8 @@ RAW_MM, RAW_GAIN = 0.55, 8.0
 #: fewer points than this tell nothing. What masks tell is undone where so many points, and such a
 #: share of them, match then, and it is so much likelier; a rigid correction the same
 LEAST_POINTS, UNDONE, PLACED = 3, (7, 0.8, 5.0), (3, 0.7, 3.0)
+#: vessel pixels that the size of a motion is taken over
+VESSEL_PIXELS = 1000
 #: unknowns of the pose, and their steps for derivatives (mm, deg, deg)
 POSE, _STEP = 3, np.array([0.1, 0.02, 0.02])
 
@@ -274,8 +276,7 @@ class _Match:
             for step, size in zip(np.diag(_STEP), _STEP, strict=True)
         ]
         step_mm = 0.1
-        size = float(np.linalg.norm(carm.source_mm)) / np.array(carm.focal_px)
-        moved = second.pixels + step_mm * field.direction / size
+        moved = second.pixels + step_mm * field.direction / pixel_size_mm(carm)
         by_mm = (gaps(carm, moved) - here) / step_mm
         modes = by_mm[:, :, None] * field.at(carm, second.pixels)[None]
         apart = first.mass[:, None] - second.mass[None]
@@ -285,7 +286,7 @@ class _Match:
         return cls(
             here, np.concatenate([np.stack(pose, axis=2), modes], axis=2),
             same * one / (_bell(apart, ANY) + 1e-3), field, normal,
-            vessel[np.linspace(0, len(vessel) - 1, min(1000, len(vessel))).astype(np.int64)],
+            thinned(vessel, VESSEL_PIXELS),
             WIDTHS_MM[-1] * coarser(max(view.pixel_at_isocenter_mm for view in pair)),
         )  # fmt: skip
 

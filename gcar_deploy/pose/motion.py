@@ -80,7 +80,7 @@ class Motion:
         carm : CArm of the picture, of any size; its pose does not matter
         pixels : (n, 2) (col, row)
         """
-        size = _pixel_mm(carm)
+        size = pixel_size_mm(carm)
         places = (pixels - np.array(carm.principal_point)) * size
         out = np.empty(len(pixels))
         for start in range(0, len(pixels), 65536):  # the kernel of a whole picture would be large
@@ -157,8 +157,8 @@ class Modes:
     @classmethod
     def of(cls, fixed: CArm, carm: CArm, pixels: Pixels) -> Modes:
         """Return those of a view beside ``fixed`` whose vessels are (n, 2) ``pixels``."""
-        places = (pixels - np.array(carm.principal_point)) * _pixel_mm(carm)
-        nodes = places[np.linspace(0, len(places) - 1, min(NODES, len(places))).astype(np.int64)]
+        places = (pixels - np.array(carm.principal_point)) * pixel_size_mm(carm)
+        nodes = thinned(places, NODES)
         values, vectors = np.linalg.eigh(_kernel(nodes, nodes))
         count = min(MODES, len(nodes))
         modes = MOTION_MM * vectors[:, -count:] / np.sqrt(np.maximum(values[-count:], 1e-9))
@@ -173,7 +173,7 @@ class Modes:
 
     def at(self, carm: CArm, pixels: Pixels) -> Array:
         """(n, k) displacement of (n, 2) pixels by each mode, mm."""
-        places = (pixels - np.array(carm.principal_point)) * _pixel_mm(carm)
+        places = (pixels - np.array(carm.principal_point)) * pixel_size_mm(carm)
         out: Array = _kernel(places, self.nodes_mm) @ self.weights
         return out
 
@@ -213,7 +213,7 @@ def estimate_motion(
     field = Modes.of(fixed.carm, carm, moving.pixels)
     basis, count = field.at(carm, moving.pixels), field.count
     normal = plane_normal(fixed.carm, carm)
-    along = field.direction / _pixel_mm(carm)
+    along = field.direction / pixel_size_mm(carm)
 
     def pose(x: Array) -> Array:
         return np.concatenate([x[0] * normal, x[1:FREE]])
@@ -255,7 +255,12 @@ def estimate_motion(
     return pose(x), field.motion(x[FREE:], rms_mm), after
 
 
-def _pixel_mm(carm: CArm) -> Array:
+def thinned(points: Array, most: int) -> Array:
+    """Return at most so many of (n, k) points, evenly along their order."""
+    return points[np.linspace(0, len(points) - 1, min(most, len(points))).astype(np.int64)]
+
+
+def pixel_size_mm(carm: CArm) -> Array:
     """(2,) width and height of a pixel at the isocentre, mm."""
     size: Array = float(np.linalg.norm(carm.source_mm)) / np.array(carm.focal_px)
     return size

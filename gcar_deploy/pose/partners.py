@@ -8,7 +8,8 @@ agree as vessels do; they are for the segmentation to tell.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import functools
+from collections.abc import Callable, Sequence
 
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.stray_lines import stray_lines, without_line
@@ -40,14 +41,14 @@ def partnered(
     -------
     views, poses : those that are not changed are the same objects
     """
-    now = list(views)
+    now, reduced = list(views), functools.cache(_reduced)  # few views change from round to round
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
     while (worst := max(pose.after for pose in poses)) > enough:
         tried = [
             [*now[:k], fewer, *now[k + 1 :]]
             for k, (view, few, may) in enumerate(zip(now, least, asked, strict=True))
             if may
-            for fewer in _reduced(view, few)
+            for fewer in reduced(view, few)
         ]
         if not tried:
             break
@@ -60,9 +61,8 @@ def partnered(
     return now, poses
 
 
-def _reduced(view: VesselImage, least_px: float) -> Iterator[VesselImage]:
+def _reduced(view: VesselImage, least_px: float) -> list[VesselImage]:
+    """Return the view without one of its lines, for each that leaves enough."""
     lines = sorted(stray_lines(view), key=lambda line: -int(line.sum()))[:MOST_LINES]
-    for line in lines:
-        left = without_line(view, line)
-        if left is not None and left.skeleton.sum() >= least_px:
-            yield left
+    left = [without_line(view, line) for line in lines]
+    return [one for one in left if one is not None and one.skeleton.sum() >= least_px]
