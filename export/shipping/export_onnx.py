@@ -23,6 +23,7 @@ from gcar_deploy.predict.encoding import (
     input_names,
 )
 from gcar_export.scenes.gantry import PAPER_VIEWS, USUAL_SPREAD_DEG, USUAL_VIEWS
+from gcar_export.shipping.row_blocks import in_blocks
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.training.dataset import PATH_CELLS, training_scene
 from gcar_export.training.examinations import FINE_CELLS_MM, PAPER_CELLS_MM
@@ -197,7 +198,7 @@ def _view_name(primary: float, secondary: float) -> str:
 
 
 def finish(out: Path, spec: dict[str, Any]) -> dict[str, Any]:
-    """Clean the graph at ``out``, put its card into it, check it and write its spec.
+    """Clean and block the graph at ``out``, put its card into it, check it and write its spec.
 
     Raises
     ------
@@ -209,6 +210,7 @@ def finish(out: Path, spec: dict[str, Any]) -> dict[str, Any]:
     model = onnx.load(str(out), load_external_data=False)
     model.ir_version = IR_VERSION
     _refuse_scatters(model)
+    in_blocks(model)
     for node in model.graph.node:
         # Where each node came from in the source is of no use to a host, and outweighs a graph.
         del node.metadata_props[:]

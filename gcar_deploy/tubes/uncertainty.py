@@ -31,6 +31,8 @@ from gcar_deploy.types import Array, Pixels, Points
 
 #: covariances are solved for every so many points and interpolated between.
 EVERY = 5
+#: ... so many right-hand sides at once: more of them leave the cache
+TOGETHER = 64
 #: a starting point errs as its neighbours do, and moves with the geometry it was found in: the
 #: starting points hold so many times less than the fit lets them
 SHARED_STARTS = 100.0
@@ -102,9 +104,12 @@ def _fit(factor: SuperLU, row: Array) -> Array:
     """(k, 3, 3) blocks of the inverse at (k, 3) rows."""
     rows, back = np.unique(row, return_inverse=True)
     back = back.reshape(row.shape)
-    unit = np.zeros((factor.shape[0], len(rows)))
-    unit[rows, np.arange(len(rows))] = 1.0
-    solved = factor.solve(unit)
+    solved = np.empty((factor.shape[0], len(rows)))
+    for start in range(0, len(rows), TOGETHER):
+        some = rows[start : start + TOGETHER]
+        unit = np.zeros((len(solved), len(some)), order="F")
+        unit[some, np.arange(len(some))] = 1.0
+        solved[:, start : start + TOGETHER] = factor.solve(unit)
     out: Array = solved[row[:, :, None], back[:, None, :]]
     return 0.5 * (out + np.swapaxes(out, 1, 2))
 
