@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gcar_deploy.beside import allowed_threads
 from gcar_deploy.config import PredictOptions, RunOptions, check_options
 from gcar_deploy.config.ranges import Range, check_number
 from gcar_deploy.errors import RefusedError, UsageError
@@ -35,7 +36,7 @@ class Engine:
     Parameters
     ----------
     model : path of an ONNX file with its spec beside it; None for the shipped one
-    threads : int, threads within one inference; None for the number of cores, at most 4
+    threads : int, threads within one reconstruction; None for the number of cores, at most 4
     options : RunOptions; ``options.predict.predictor`` says which predictor
     session : an existing ``onnxruntime.InferenceSession`` of that model
 
@@ -191,18 +192,19 @@ class Engine:
             task.views, task.geometry, options, task.masks, task.drawn
         )
         wanted = options.imaging.segmenter if asks_network(angiograms) else "classic"
-        found = reconstruct(
-            angiograms,
-            grid,
-            options,
-            predictor=predictor,
-            segmenter=self._needed_segmenter(wanted),
-            on_progress=on_progress,
-            deadline_s=task.deadline_s,
-            cancel=cancel,
-            used_s=time.perf_counter() - started,
-            on_step=on_step,
-        )
+        with allowed_threads(self.threads):
+            found = reconstruct(
+                angiograms,
+                grid,
+                options,
+                predictor=predictor,
+                segmenter=self._needed_segmenter(wanted),
+                on_progress=on_progress,
+                deadline_s=task.deadline_s,
+                cancel=cancel,
+                used_s=time.perf_counter() - started,
+                on_step=on_step,
+            )
         return Result.of(found, (*notes, *missing, *found.notes))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from gcar_deploy.beside import started
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.frame import own_frame
@@ -36,7 +37,7 @@ from gcar_deploy.tubes import refine, refined_volume
 #: stages with their usual share of the time
 STAGES = (
     ("vessels", 3.0), ("pose", 2.0), ("candidates", 1.0), ("centers", 2.0), ("refine", 6.0),
-    ("tree", 1.0), ("quality", 0.5), ("diameters", 0.5),
+    ("quality", 0.5), ("diameters", 0.5), ("tree", 1.0),
 )  # fmt: skip
 
 
@@ -134,9 +135,9 @@ def _reconstructed(
         refined = refined.with_tree(joined_over_lesions(refined.tree, signals))
         refined, missed = refined.without(options.deleted_mm)
         keep(refined)
-    with watch.stage("tree", keep_if_late=True):
         check_tree(refined.tree, options.quality)
-        volume = refined_volume(refined, placed.views, grid, options.refine)
+    # Nothing but the result asks for the voxels: they are made beside what follows.
+    made = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
     with watch.stage("quality", keep_if_late=True), placed.hinting():
         for stage in (vessels, placed, centers, refined):
             findings += stage.findings
@@ -150,6 +151,8 @@ def _reconstructed(
     with watch.stage("diameters", keep_if_late=True):
         sections = measure_sections(tree, signals)
         tree = with_diameters(tree, sections)
+    with watch.stage("tree", keep_if_late=True):
+        volume = made()
     return Reconstruction(
         quality=judged, tree=tree, sections=sections, gaussians=refined.gaussians,
         volume=volume, grid=grid,

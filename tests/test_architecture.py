@@ -17,7 +17,7 @@ PACKAGE = PACKAGES["gcar_deploy"]
 #: from the ground up: a room imports those of lower floors alone; rooms on one floor keep apart
 RUNTIME_FLOORS = (
     "errors types files plain",
-    "config stopwatch",
+    "config stopwatch beside",
     "geometry",
     "models",
     "imaging",

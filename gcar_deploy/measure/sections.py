@@ -10,11 +10,13 @@ the clearest sections of the same picture. The views' areas are then joined alon
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
+from gcar_deploy.beside import side_by_side
 from gcar_deploy.measure.overlaps import Course, hidden_samples, within_others
 from gcar_deploy.measure.profile import DEPTH, GROUND, HALF, Belief, Fitted, Profiles, fit_profiles
 from gcar_deploy.measure.signals import Signal
@@ -123,7 +125,7 @@ def measure_sections(tree: Tree, signals: Sequence[Signal]) -> tuple[Sections, .
         return ()
     places = _places(tree)
     joined = within_others(places.points_mm, places.radius_mm, places.branch)
-    seen = [_seen(places, signal) for signal in signals]
+    seen = side_by_side([functools.partial(_seen, places, signal) for signal in signals])
     seen = [dataclasses.replace(v, sd=np.where(joined, np.maximum(v.sd, 1.0), v.sd)) for v in seen]
     out = []
     for k in range(len(tree.branches)):

@@ -7,11 +7,13 @@ of the ONNX graph, which itself holds only gathers, matrix products and scatters
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
+from gcar_deploy.beside import side_by_side, started
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.hull import Candidates, bilinear_of
 from gcar_deploy.types import Array, Image
@@ -66,14 +68,15 @@ def encode(candidates: Candidates, views: Sequence[tuple[CArm, Image, bool]]) ->
         As given to ``visual_hull``; ``calibrated`` says whether path lengths are true mm.
     """
     h = candidates.spacing_mm
-    per_view = [
-        _view_inputs(candidates, carm, path, calibrated, h) for carm, path, calibrated in views
-    ]
+    levels = started(functools.partial(_levels, candidates.index))
+    per_view = side_by_side(
+        [functools.partial(_view_inputs, candidates, *view, h) for view in views]
+    )
     longest = max((len(p[2]) for p in per_view), default=1)
     ray_path = np.zeros((len(per_view), max(longest, 1)), np.float32)
     for k, p in enumerate(per_view):
         ray_path[k, : len(p[2])] = p[2]
-    neighbours, parent = _levels(candidates.index)
+    neighbours, parent = levels()
     ray = np.stack([p[1] for p in per_view])
     widest = max((int(np.bincount(r).max(initial=1)) for r in ray), default=1)
     rays = ray_path.shape[1]

@@ -15,12 +15,14 @@ hold if the branch is there at all: another vessel behind the same rays is anoth
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
+from gcar_deploy.beside import side_by_side
 from gcar_deploy.errors import NumericalError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
@@ -104,14 +106,20 @@ def _fit(factor: SuperLU, row: Array) -> Array:
     """(k, 3, 3) blocks of the inverse at (k, 3) rows."""
     rows, back = np.unique(row, return_inverse=True)
     back = back.reshape(row.shape)
-    solved = np.empty((factor.shape[0], len(rows)))
-    for start in range(0, len(rows), TOGETHER):
-        some = rows[start : start + TOGETHER]
-        unit = np.zeros((len(solved), len(some)), order="F")
-        unit[some, np.arange(len(some))] = 1.0
-        solved[:, start : start + TOGETHER] = factor.solve(unit)
+    parts = [rows[start : start + TOGETHER] for start in range(0, len(rows), TOGETHER)]
+    solved = np.concatenate(
+        side_by_side([functools.partial(_columns, factor, part) for part in parts]), axis=1
+    )
     out: Array = solved[row[:, :, None], back[:, None, :]]
     return 0.5 * (out + np.swapaxes(out, 1, 2))
+
+
+def _columns(factor: SuperLU, rows: Array) -> Array:
+    """(unknowns, m) columns of the inverse."""
+    unit = np.zeros((factor.shape[0], len(rows)), order="F")
+    unit[rows, np.arange(len(rows))] = 1.0
+    out: Array = factor.solve(unit)
+    return out
 
 
 def _geometry(factor: SuperLU, row: Array, tubes: Tubes, views: Sequence[Seen]) -> Array:
