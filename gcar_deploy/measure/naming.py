@@ -73,6 +73,7 @@ RULES = {
         ("left", LEFT_FIGURES, _LEFT_RULES), ("right", RIGHT_FIGURES, _RIGHT_RULES),
     )
 }  # fmt: skip
+_LEAST_LOWER = _LEFT_RULES["lad lower"][0]
 _PARTS = np.array([0.0, 0.15, 0.4, 0.7, 1.0])
 
 
@@ -249,7 +250,11 @@ class _Reach:
 
 
 def _left(a: Route, c: Route, reach: _Reach, calibre: float, whole: float) -> Reading | None:
-    """Read two ways as LAD and LCx with their common trunk; None where they have none."""
+    """Read two ways as LAD and LCx; None without a common trunk, or if the LAD ends too high."""
+    lower = (c.points_mm[-1, 2] - a.points_mm[-1, 2]) / 20.0
+    if lower < _LEAST_LOWER:
+        # Most pairs end here: two ways are read either way round.
+        return None
     shared = _shared(a, c)
     trunk = a.node_arc_mm[shared]
     lad, lcx = a.length_mm - trunk, c.length_mm - trunk
@@ -271,7 +276,7 @@ def _left(a: Route, c: Route, reach: _Reach, calibre: float, whole: float) -> Re
         np.log(2 * r_trunk / (r_lad + r_lcx)), np.log(r_lad / r_lcx), calibre,
         np.linalg.norm(a.points_mm[-1] - fork) / lad, np.linalg.norm(c.points_mm[-1] - fork) / lcx,
         (reach.to_apex_mm - own_a) / 20.0, (reach.to_back_mm - c.points_mm[-1, 1]) / 20.0,
-        (trunk + lad + lcx) / whole, (c.points_mm[-1, 2] - a.points_mm[-1, 2]) / 20.0,
+        (trunk + lad + lcx) / whole, lower,
     ]  # fmt: skip
     return Reading("left", names, np.array(figures), a.nodes[0])
 

@@ -13,6 +13,7 @@ Where tubes overlap in space, a ray's intervals through them are united, not add
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -152,22 +153,22 @@ def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None =
         From an earlier call; used where the tubes have moved little since.
     """
     pixels, depth = carm.project(tubes.points_mm)
-    per_mm = np.sqrt(np.prod(carm.focal_px)) / np.maximum(depth, 1.0)
+    per_mm = math.sqrt(math.prod(carm.focal_px)) / np.maximum(depth, 1.0)
     reach = tubes.radius_mm * per_mm + 0.5 * box_px
     i, j = tubes.first, tubes.second
     if pairing is None or not pairing.fits(pixels, reach):
         segments = i, j, tubes.branch
         pairing = paired(pixels, reach, depth > 1.0, segments, (carm.rows, carm.columns))
-    begins, finishes = _is_end(tubes, -1), _is_end(tubes, 1)
+    begins, finishes = _ends(tubes.point_branch)
     stretch = _inverse_sine(tubes.points_mm, pixels, per_mm, begins, finishes)
     step = pixels[j] - pixels[i]
     inverse = 1.0 / np.maximum(np.einsum("ij,ij->i", step, step), 1e-12)
     # What is linear along a segment, at its first point and the change to its second.
-    linear = np.stack([tubes.log_radius, per_mm, stretch, depth])
+    linear = np.array([tubes.log_radius, per_mm, stretch, depth])
     # Beyond the ends of a branch caps are round: t there is at most 0, or at least 1.
     caps = [np.where(begins[i], 0.0, -1.0), np.where(finishes[j], 1.0, 2.0)]
     table = [*pixels[i].T, *step.T, inverse, *caps, *linear[:, i], *(linear[:, j] - linear[:, i])]
-    x, y, dx, dy, inverse, low, high, *values = np.repeat(np.stack(table), pairing.count, axis=1)
+    x, y, dx, dy, inverse, low, high, *values = np.repeat(np.array(table), pairing.count, axis=1)
     log_radius, scale, stretch, middle = values[:4]
     x, y = pairing.col - x, pairing.row - y
     t = np.minimum(np.maximum((x * dx + y * dy) * inverse, 0.0), 1.0)
@@ -189,7 +190,7 @@ def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None =
     return Footprint(
         t=t,
         path_mm=path,
-        d_axis=np.stack([x * towards, y * towards]),
+        d_axis=np.array([x * towards, y * towards]),
         d_log_radius=d_radius * radius * to_mm,
         crossings=crossings[pairing.group],
         pairing=pairing,
@@ -201,8 +202,9 @@ def box_chord(distance: Scalars, radius: Scalars, box: float) -> tuple[Scalars, 
 
     All lengths in one unit. Returns (length, by distance, by radius), each (n,).
     """
-    upper = np.clip((distance + 0.5 * box) / radius, -1.0, 1.0)
-    lower = np.clip((distance - 0.5 * box) / radius, -1.0, 1.0)
+    # Not np.clip, whose call takes as long as the work.
+    upper = np.minimum(np.maximum((distance + 0.5 * box) / radius, -1.0), 1.0)
+    lower = np.minimum(np.maximum((distance - 0.5 * box) / radius, -1.0), 1.0)
     root_u, root_l = np.sqrt(1 - upper * upper), np.sqrt(1 - lower * lower)
     angle = np.arcsin(upper) - np.arcsin(lower)
     length = radius * radius * (upper * root_u - lower * root_l + angle) / box
@@ -224,15 +226,14 @@ def _inverse_sine(
     seen2 = np.einsum("ij,ij->i", shift, shift)
     scale = 0.5 * (per_mm[before] + per_mm[after])
     sine = np.sqrt(seen2 / np.maximum(scale * scale * length2, 1e-18))
-    return 1.0 / np.clip(sine, MIN_SINE, 1.0)
+    return 1.0 / np.minimum(np.maximum(sine, MIN_SINE), 1.0)
 
 
-def _is_end(tubes: Tubes, side: int) -> Array:
-    """(n,) whether a branch point is the first (side -1) or last (side 1) of its branch."""
-    point = np.arange(len(tubes.point_branch))
-    neighbour = np.clip(point + side, 0, len(point) - 1)
-    out: Array = (tubes.point_branch[neighbour] != tubes.point_branch) | (neighbour == point)
-    return out
+def _ends(point_branch: Array) -> tuple[Array, Array]:
+    """(n,) whether a branch point is the first of its branch, and whether it is the last."""
+    begins, finishes = np.ones((2, len(point_branch)), bool)
+    begins[1:] = finishes[:-1] = point_branch[1:] != point_branch[:-1]
+    return begins, finishes
 
 
 def _union_factor(pairing: Pairing, middle: Scalars, path: Scalars) -> Scalars:
@@ -243,12 +244,11 @@ def _union_factor(pairing: Pairing, middle: Scalars, path: Scalars) -> Scalars:
     both = one + two
     # Overlap of two intervals: what their halves reach beyond the distance of their middles.
     shared = 0.5 * both - np.abs(middle[b] - middle[a])
-    shared = np.clip(shared, 0.0, np.minimum(one, two))
+    shared = np.minimum(np.maximum(shared, 0.0), np.minimum(one, two))
     factor[a] = factor[b] = (both - shared) / np.maximum(both, 1e-12)
     more = pairing.several
     if len(more):
-        group = np.cumsum(np.diff(pairing.group[more], prepend=-1) != 0) - 1
-        factor[more] = _union_share(group, middle[more], path[more])
+        factor[more] = _union_share(pairing.several_group, middle[more], path[more])
     return factor
 
 

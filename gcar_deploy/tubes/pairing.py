@@ -38,6 +38,7 @@ class Pairing:
     group : (e,) which of ``covered`` a crossing's pixel is
     double : (2, k) crossings that share their pixel with one other
     several : (m,) crossings that share theirs with more, sorted by pixel
+    several_group : (m,) number of their pixel among those of such crossings
     corner, reach : (n, 2), (n,) projected points and reach (px) the crossings were found for
     """
 
@@ -50,6 +51,7 @@ class Pairing:
     group: Array
     double: Array
     several: Array
+    several_group: Array
     corner: Array
     reach: Scalars
 
@@ -117,7 +119,7 @@ def paired(
     place[order] = np.arange(len(order))
     start = np.flatnonzero(new)
     shared = np.diff(np.append(start, len(pixel)))
-    two = start[shared == 2]
+    two, crowded = start[shared == 2], shared > 2
     pixel, segment = pixel[order], segment[order]
     down = pixel // shape[1]
     return Pairing(
@@ -129,7 +131,8 @@ def paired(
         covered=covered,
         group=group[order],
         double=np.stack([place[two], place[two + 1]]),
-        several=place[(shared > 2)[group]],
+        several=place[crowded[group]],
+        several_group=np.repeat(np.arange(np.count_nonzero(crowded)), shared[crowded]),
         corner=pixels,
         reach=reach,
     )
