@@ -256,7 +256,7 @@ class CArm:
         P = self.world2pixel
         return -np.linalg.solve(P[:, :3], P[:, 3])
 
-    @property
+    @cached_property
     def focal_px(self) -> tuple[float, float]:
         """(columns, rows): SDD over the pixel spacing, pixels."""
         P = self.world2pixel[:, :3]

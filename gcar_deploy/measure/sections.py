@@ -402,11 +402,12 @@ def _joined(places: _Places, own: Array, seen: Sequence[_Seen]) -> Sections:
 
 def _inverse_diagonal(band: Array) -> Scalars:
     """Diagonal of the inverse of a symmetric tridiagonal matrix, by its two sweeps."""
-    d, e = band[0], band[1, :-1]
-    n = len(d)
-    down, up = d.copy(), d.copy()
+    # Plain numbers: one at a time, those of an array take several times as long.
+    squares = (band[1, :-1] ** 2).tolist()
+    down, up = band[0].tolist(), band[0].tolist()
+    n = len(down)
     for k in range(1, n):
-        down[k] -= e[k - 1] ** 2 / down[k - 1]
-        up[n - 1 - k] -= e[n - 1 - k] ** 2 / up[n - k]
-    out: Scalars = 1.0 / (down + up - d)
+        down[k] -= squares[k - 1] / down[k - 1]
+        up[n - 1 - k] -= squares[n - 1 - k] / up[n - k]
+    out: Scalars = 1.0 / (np.array(down) + np.array(up) - band[0])
     return out

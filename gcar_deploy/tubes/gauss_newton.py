@@ -227,21 +227,24 @@ def basis_of(seen: Footprint) -> Array:
 
 def moments_of(seen: Footprint, basis: Array, weight: Scalars) -> Array:
     """(s, 6, 6) weighted sums of products of the derivatives over each segment's entries."""
-    count = seen.pairing.count
-    out = np.empty((6, 6, len(count)))
-    for a in range(6):
-        out[a, a:] = sums_of(seen, basis[a:] * (weight * basis[a]))
-        out[a:, a] = out[a, a:]
+    weighed = weight * basis
+    one, other = np.triu_indices(6)
+    sums = sums_of(seen, np.concatenate([basis[a:] * weighed[a] for a in range(6)]))
+    out = np.empty((6, 6, sums.shape[1]))
+    out[one, other] = out[other, one] = sums
     return np.moveaxis(out, -1, 0)
 
 
 def sums_of(seen: Footprint, values: Array) -> Array:
     """(k, s) sums of (k, e) values over each segment's entries."""
-    count = seen.pairing.count
-    out = np.zeros((len(values), len(count)))
-    some = np.flatnonzero(count)
+    count = len(seen.pairing.count)
+    some, first = seen.pairing.starts
+    if len(some) == count > 0:
+        whole: Array = np.add.reduceat(values, first, axis=1)
+        return whole
+    out = np.zeros((len(values), count))
     if len(some):
-        out[:, some] = np.add.reduceat(values, (np.cumsum(count) - count)[some], axis=1)
+        out[:, some] = np.add.reduceat(values, first, axis=1)
     return out
 
 

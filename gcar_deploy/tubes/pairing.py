@@ -7,6 +7,7 @@ nearest stays so but for pixels that lie between two of them, where either says 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -54,6 +55,12 @@ class Pairing:
     several_group: Array
     corner: Array
     reach: Scalars
+
+    @functools.cached_property
+    def starts(self) -> tuple[Array, Array]:
+        """Segments that have crossings, and the first crossing of each."""
+        some = np.flatnonzero(self.count)
+        return some, (np.cumsum(self.count) - self.count)[some]
 
     def fits(self, pixels: Array, reach: Scalars) -> bool:
         """Whether tubes at these pixels, with this reach, lie within the margin."""
@@ -223,4 +230,6 @@ def _stretch(low: Scalars, high: Scalars, slope: Scalars) -> tuple[Scalars, Scal
 
 def _whole(values: Scalars, limit: int) -> Array:
     """Whole numbers within 0 .. limit; NaN to 0."""
-    return np.clip(np.nan_to_num(values, nan=0.0), 0, limit).astype(np.int64)
+    # Comparisons with NaN are false.
+    out: Array = np.where(values > 0, np.minimum(values, limit), 0).astype(np.int64)
+    return out
