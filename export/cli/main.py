@@ -12,6 +12,7 @@ import click
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli.centers import centers_table, robustness
+from gcar_export.cli.devices import train_devices
 from gcar_export.cli.evaluate import converge, evaluate, paper_page
 from gcar_export.cli.frames import frame_pairs
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
@@ -308,6 +309,7 @@ for _verb in (
     gate_table,
     wrong_scenes,
     frame_pairs,
+    train_devices,
     ghost_fit,
     status_table,
 ):
@@ -391,12 +393,15 @@ def train_segmenter(
 @main.command("export-segmenter")
 @click.argument("checkpoint", type=_FILE)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-def export_segmenter(checkpoint: Path, out: Path) -> None:
+@click.option("--devices", type=_FILE, help="Checkpoint of train-devices, to go into it.")
+def export_segmenter(checkpoint: Path, out: Path, devices: Path | None) -> None:
     """Turn the segmentation network's CHECKPOINT into one ONNX file with its spec, and prove it.
+
+    CHECKPOINT may be an ONNX model, whose segmenter is taken as it is.
 
     Example: gcar-export export-segmenter runs/s/checkpoint.safetensors --out segmenter.onnx
     """
     from gcar_export.shipping import export_segmenter as exporting
 
-    worst = exporting.export_segmenter(checkpoint, out)
+    worst = exporting.export_segmenter(checkpoint, out, devices=devices)
     click.echo(f"{out}: largest difference of a probability {worst:.1e}")

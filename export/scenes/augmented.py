@@ -37,9 +37,14 @@ class Labelled:
     zoom: tuple[float, float]
 
 
-def augmented_pair(rng: np.random.Generator, given: Labelled) -> tuple[Array, Array]:
-    """Return the network's input and truth of a crop, as ``angiograms.training_pair`` does."""
-    maps, inside, zoom = _placed(rng, given)
+def augmented_pair(
+    rng: np.random.Generator, given: Labelled, side: int = SIDE, turn_deg: float = TURN_DEG
+) -> tuple[Array, Array]:
+    """Return the network's input and truth of a crop, as ``angiograms.training_pair`` does.
+
+    ``side``: of the crop, pixels; ``turn_deg``: it is turned by no more.
+    """
+    maps, inside, zoom = _placed(rng, given, side, turn_deg)
     pixels = cv2.remap(
         np.asarray(given.pixels, np.float32), *maps, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REFLECT_101,
@@ -57,34 +62,36 @@ def augmented_pair(rng: np.random.Generator, given: Labelled) -> tuple[Array, Ar
     return channels, truth
 
 
-def _placed(rng: np.random.Generator, given: Labelled) -> tuple[tuple[Image, Image], Array, float]:
+def _placed(
+    rng: np.random.Generator, given: Labelled, side: int, turn_deg: float
+) -> tuple[tuple[Image, Image], Array, float]:
     """Where each pixel of the crop comes from (col, row), whether it exists, the enlargement."""
     rows, columns = given.pixels.shape
     zoom = float(np.exp(rng.uniform(*np.log(given.zoom))))
     turned = rng.integers(10) >= STRAIGHT
-    angle = np.radians(rng.uniform(-TURN_DEG, TURN_DEG) if turned else 0.0)
+    angle = np.radians(rng.uniform(-turn_deg, turn_deg) if turned else 0.0)
     linear = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) / zoom
     linear[:, 0] *= rng.choice([-1, 1])
     linear[:, 1] *= rng.choice([-1, 1])
     if rng.integers(2):
         linear = linear[:, ::-1]
     # The crop lies within the picture as far as it can.
-    free = np.maximum(np.array([columns, rows]) - SIDE / zoom, 0.0) / 2
+    free = np.maximum(np.array([columns, rows]) - side / zoom, 0.0) / 2
     middle = np.array([columns - 1, rows - 1]) / 2 + rng.uniform(-1, 1, 2) * free
-    row, col = np.indices((SIDE, SIDE), dtype=np.float32) - (SIDE - 1) / 2
+    row, col = np.indices((side, side), dtype=np.float32) - (side - 1) / 2
     if rng.integers(2):
         scale = rng.uniform(*_WAVE_PX)
         for part in (col, row):
-            part += np.float32(rng.uniform(0, _WAVE_SHARE) * scale) * _smooth(rng, scale)
+            part += np.float32(rng.uniform(0, _WAVE_SHARE) * scale) * _smooth(rng, side, scale)
     x = (linear[0, 0] * col + linear[0, 1] * row + middle[0]).astype(np.float32)
     y = (linear[1, 0] * col + linear[1, 1] * row + middle[1]).astype(np.float32)
     return (x, y), (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1), zoom
 
 
-def _smooth(rng: np.random.Generator, scale: float) -> Image:
-    """(SIDE, SIDE) noise of unit variance."""
-    coarse = rng.standard_normal((SIDE // 8, SIDE // 8)).astype(np.float32)
-    noise = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), scale / 8), (SIDE, SIDE))
+def _smooth(rng: np.random.Generator, side: int, scale: float) -> Image:
+    """(side, side) noise of unit variance; ``side`` a multiple of 8."""
+    coarse = rng.standard_normal((side // 8, side // 8)).astype(np.float32)
+    noise = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), scale / 8), (side, side))
     return np.asarray(noise / noise.std(), np.float32)
 
 
@@ -93,7 +100,9 @@ def _regraded(rng: np.random.Generator, pixels: Image) -> Image:
     top = max(float(pixels.max()), 1.0)
     out = (np.clip(pixels, 0, None) / np.float32(top)) ** np.float32(np.exp(rng.normal(0, 0.3)))
     if rng.random() < 0.3:
-        out = out * np.exp(np.float32(rng.uniform(0, 0.2)) * _smooth(rng, rng.uniform(20, 60)))
+        out = out * np.exp(
+            np.float32(rng.uniform(0, 0.2)) * _smooth(rng, len(out), rng.uniform(20, 60))
+        )
     if rng.random() < 0.5:
         wide = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.5, 3.0))
         out = out + np.float32(rng.uniform(-0.7, 1.0)) * (out - wide)

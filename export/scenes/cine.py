@@ -12,6 +12,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.types import Array, Image
 from gcar_export.scenes.angiogram_scenery import scenery
 from gcar_export.scenes.angiogram_vessels import Vessels, catheter
+from gcar_export.scenes.angiograms import DEVICE, PERHAPS_PX
 from gcar_export.scenes.beating import Heartbeat, RunMotion, random_heartbeat, random_run
 from gcar_export.scenes.gantry import clinical_views
 from gcar_export.scenes.render import path_lengths
@@ -42,12 +43,14 @@ class CineRun:
     motion : RunMotion
     path_mm : (n, SIDE, SIDE) float32, chords through lumen times its share of contrast
     pixels : (n, SIDE, SIDE) uint8, vessels dark
+    device : (n, SIDE, SIDE) bool, catheter, leads, wires and clips beside vessels
     """
 
     carm: CArm
     motion: RunMotion
     path_mm: Array
     pixels: Array
+    device: Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,8 +132,8 @@ def _run(
     ])  # fmt: skip
     middle = carm.project(motion.shift_mm)[0]
     squeeze = beat.squeeze(motion.phases % 1.0)
-    pixels = _exposed(rng, carm, paths, ostium, middle - middle[0], squeeze)
-    return CineRun(carm, motion, paths, pixels)
+    pixels, device = _exposed(rng, carm, paths, ostium, middle - middle[0], squeeze)
+    return CineRun(carm, motion, paths, pixels, device)
 
 
 def _contrast(tree: SyntheticTree, front_mm: float, late: float) -> list[Array]:
@@ -171,8 +174,8 @@ def _drawn(
 def _exposed(
     rng: np.random.Generator, carm: CArm, paths: Array, ostium: Array, shift_px: Array,
     squeeze: Array,
-) -> Array:  # fmt: skip
-    """(n, rows, columns) uint8: one patient, one machine, one display, new quanta in each frame.
+) -> tuple[Array, Array]:  # fmt: skip
+    """One patient, one machine, one display, new quanta in each frame; and where devices are.
 
     Parameters
     ----------
@@ -180,6 +183,11 @@ def _exposed(
     ostium : (n, 2, 2) first points of the tree in each frame, (col, row)
     shift_px : (n, 2) how far the patient is from where he was in the first frame, (col, row)
     squeeze : (n,) contraction of the heart
+
+    Returns
+    -------
+    pixels : (n, rows, columns) uint8
+    device : (n, rows, columns) bool, of catheter, leads, wires and clips, beside vessels
     """
     pixel_mm = carm.pixel_at_isocenter_mm
     patient, devices = scenery(rng, SIDE, pixel_mm)
@@ -199,18 +207,20 @@ def _exposed(
     blur, gamma = rng.uniform(0.4, 1.1), rng.uniform(0.5, 1.2)
     # Breathing moves what is behind the heart by more or less than the heart.
     along, heart = rng.uniform(0.3, 1.5), rng.uniform(0, 0.25) * _shadow(rng)
-    light = []
+    light, shown_device = [], []
     for k, path in enumerate(paths):
         ground = _pulled(patient, along * shift_px[k])
         ground = ground + heart * (1 - squeeze[k])
         own = _pulled(tube, ostium[k, 0] - ostium[0, 0], ostium[0, 0])
         absorbed = per_mm * np.maximum(path, own) + ground
+        lines = np.maximum(per_mm * own, _pulled(devices, along * shift_px[k]))
+        shown_device.append((lines > DEVICE) & (path <= PERHAPS_PX * pixel_mm))
         light.append(ndimage.gaussian_filter(np.exp(-absorbed), blur))
     counts = rng.poisson(quanta * np.stack(light)) / quanta
     shown = np.stack([ndimage.gaussian_filter(one, 0.5) for one in counts]) ** gamma
     low, high = np.quantile(shown, [0.003, 0.995])
     grey = 10 + 235 * (shown - low) / max(float(high - low), 1e-9)
-    return np.clip(grey, 0, 255).round().astype(np.uint8)
+    return np.clip(grey, 0, 255).round().astype(np.uint8), np.stack(shown_device)
 
 
 def _shadow(rng: np.random.Generator) -> Image:

@@ -1,4 +1,7 @@
-"""From a checkpoint of the segmentation network to one ONNX file with its spec, and the proof."""
+"""From checkpoints of the segmentation network to one ONNX file with its spec, and the proof.
+
+One file holds two networks: the segmenter, and the one that tells devices from its answers.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
+from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
+from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
+from gcar_export.training.segmenter_start import begin_with
 
 #: seed of the pictures that parity is checked on
 PARITY_SEED = 70_002
@@ -50,21 +56,32 @@ class _GroupNorm(torch.nn.Module):
 
 
 class _Deployed(torch.nn.Module):
-    def __init__(self, net: MaskUNet) -> None:
+    """Both networks as one: probability, chords, probability of a device."""
+
+    def __init__(self, net: MaskUNet, devices: DeviceUNet | None) -> None:
         super().__init__()
-        self.net = net
-        for level in (*net.down, *net.up):
-            for k, part in enumerate(level):
-                if isinstance(part, torch.nn.GroupNorm):
-                    level[k] = _GroupNorm(part)
+        self.net, self.devices = net, devices
+        for part in [*net.modules(), *(devices.modules() if devices else ())]:
+            for name, norm in list(part.named_children()):
+                if isinstance(norm, torch.nn.GroupNorm):
+                    setattr(part, name, _GroupNorm(norm))
 
     def forward(self, channels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         logit, chord, device = self.net(channels).split(1, dim=1)
-        return torch.sigmoid(logit), chord, torch.sigmoid(device)
+        vessel, device = torch.sigmoid(logit), torch.sigmoid(device)
+        if self.devices is not None:
+            half = self.devices(torch.cat([channels, vessel, chord, device], dim=1))
+            finer = torch.nn.functional.interpolate(half, scale_factor=2.0, mode="bilinear")
+            device = torch.sigmoid(finer)
+        return vessel, chord, device
 
 
 def load_segmenter_checkpoint(path: Path) -> MaskUNet:
-    """Read ``checkpoint.safetensors`` beside its ``manifest.json``."""
+    """Read ``checkpoint.safetensors`` beside its ``manifest.json``, or an ONNX segmenter."""
+    if path.suffix == ".onnx":
+        net = MaskUNet(MaskUNetConfig())
+        begin_with(net, path)
+        return net.eval()
     config = dict(json.loads((path.parent / "manifest.json").read_text())["config"])
     config["width"] = tuple(config["width"])
     net = MaskUNet(MaskUNetConfig(**config))
@@ -73,24 +90,43 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
     return net.eval()
 
 
-class _CheckpointSession:
-    """Answers as ``models.Session`` does, from a checkpoint that was not exported."""
+def load_device_checkpoint(path: Path) -> DeviceUNet:
+    """Read the ``checkpoint.safetensors`` of ``training.devices`` beside its ``manifest.json``."""
+    config = dict(read_manifest(path)["config"])
+    config["width"] = tuple(config["width"])
+    net = DeviceUNet(DeviceUNetConfig(**config))
+    filled(net, read_tensors(path), path.name)
+    return net.eval()
 
-    def __init__(self, checkpoint: Path) -> None:
-        self.net = _Deployed(load_segmenter_checkpoint(checkpoint)).eval()
+
+class _CheckpointSession:
+    """Answers as ``models.Session`` does, from checkpoints that were not exported."""
+
+    def __init__(self, checkpoint: Path, devices: Path | None) -> None:
+        told = None if devices is None else load_device_checkpoint(devices)
+        self.net = _Deployed(load_segmenter_checkpoint(checkpoint), told).eval()
 
     def run(self, inputs: Mapping[str, Array], *_: object, **__: object) -> list[Array]:
         with torch.no_grad():
             return [m.numpy() for m in self.net(torch.from_numpy(inputs["channels"]))]
 
 
-def checkpoint_segmenter(checkpoint: Path) -> Segmenter:
-    """Open a checkpoint as if it were a model, for looking at it."""
-    return Segmenter(cast(Session, _CheckpointSession(checkpoint)))
+def checkpoint_segmenter(checkpoint: Path, devices: Path | None = None) -> Segmenter:
+    """Open checkpoints as if they were a model, for looking at them."""
+    return Segmenter(cast(Session, _CheckpointSession(checkpoint, devices)))
 
 
-def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
+def export_segmenter(
+    checkpoint: Path, out: Path, pictures: int = 4, devices: Path | None = None
+) -> float:
     """Write ``out`` (.onnx) and its spec (.json).
+
+    Parameters
+    ----------
+    checkpoint : of the segmenter, or an ONNX model whose segmenter is taken as it is
+    out : the file
+    pictures : generated ones that torch and ONNX Runtime are compared on
+    devices : checkpoint of the device network, or None: the segmenter's own answer stays
 
     Returns
     -------
@@ -104,7 +140,8 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
     """
     import onnx
 
-    net = _Deployed(load_segmenter_checkpoint(checkpoint)).eval()
+    told = None if devices is None else load_device_checkpoint(devices)
+    net = _Deployed(load_segmenter_checkpoint(checkpoint), told).eval()
     example = torch.zeros(1, INPUT["channels"], 8 * STRIDE, 9 * STRIDE)
     rows, cols = (torch.export.Dim(n, min=2, max=512) for n in ("rows", "cols"))
     program: Any = torch.onnx.export(
@@ -127,7 +164,7 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
     del model.metadata_props[:]
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(out))
-    _write_spec(checkpoint, out, net)
+    _write_spec(_training(checkpoint, devices), out, net)
     worst = _largest_difference(net, out, pictures)
     if worst > PARITY:
         for path in (out, out.with_suffix(".json")):
@@ -138,9 +175,19 @@ def export_segmenter(checkpoint: Path, out: Path, pictures: int = 4) -> float:
     return worst
 
 
-def _write_spec(checkpoint: Path, out: Path, net: torch.nn.Module) -> None:
+def _training(checkpoint: Path, devices: Path | None) -> dict[str, Any]:
+    """Say what both were trained on, as the manifests beside them do."""
+    if checkpoint.suffix == ".onnx":
+        training = dict(json.loads(checkpoint.with_suffix(".json").read_text())["training"])
+    else:
+        training = json.loads((checkpoint.parent / "manifest.json").read_text())
+    if devices is not None:
+        training["devices"] = read_manifest(devices)
+    return training
+
+
+def _write_spec(training: Mapping[str, Any], out: Path, net: torch.nn.Module) -> None:
     data = out.read_bytes()
-    training = json.loads((checkpoint.parent / "manifest.json").read_text())
     spec = {
         "schema": "gcar-model/1",
         "name": out.stem,

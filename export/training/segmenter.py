@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import click
 import cv2
@@ -107,10 +107,7 @@ def chosen(preset: str, given: Mapping[str, Any]) -> SegmenterOptions:
     """
     changed = dict(given)
     if "fold" in changed:
-        number, slash, of = str(changed["fold"]).partition("/")
-        if not (slash and number.isdigit() and of.isdigit()):
-            raise UsageError(f"fold {changed['fold']}: must be K/N, for example 1/5")
-        changed["fold"] = (int(number), int(of))
+        changed["fold"] = fold_of(str(changed["fold"]))
     if "real" in changed:
         changed["real"] = str(changed["real"])
     options = dataclasses.replace(PRESETS[preset], **changed)
@@ -122,7 +119,41 @@ def chosen(preset: str, given: Mapping[str, Any]) -> SegmenterOptions:
     )
 
 
-def learning_rate(options: SegmenterOptions, step: int) -> float:
+def fold_of(text: str) -> tuple[int, int]:
+    """Read ``K/N``.
+
+    Raises
+    ------
+    UsageError
+        Not two numbers.
+    """
+    number, slash, of = text.partition("/")
+    if not (slash and number.isdigit() and of.isdigit()):
+        raise UsageError(f"fold {text}: must be K/N, for example 1/5")
+    return int(number), int(of)
+
+
+class Schedule(Protocol):
+    """What the learning rate of a step depends on."""
+
+    @property
+    def steps(self) -> int:
+        """Steps in all."""
+
+    @property
+    def decay_steps(self) -> int:
+        """Of them the last ones, in which the rate falls to zero."""
+
+    @property
+    def warmup_steps(self) -> int:
+        """Of them the first ones, in which it rises."""
+
+    @property
+    def learning_rate(self) -> float:
+        """In between."""
+
+
+def learning_rate(options: Schedule, step: int) -> float:
     """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
     up = min(1.0, (step + 1) / options.warmup_steps)
     down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
@@ -234,20 +265,20 @@ def validate(net: MaskUNet, options: SegmenterOptions) -> float:
     return float(np.mean(scores))
 
 
-def real_pictures(options: SegmenterOptions) -> tuple[ExpertPicture, ...]:
-    """Return the real pictures that these options train on.
+def real_pictures(real: str, fold: tuple[int, int]) -> tuple[ExpertPicture, ...]:
+    """Return the pictures of a folder that a run trains on: all, or all but those of a fold.
 
     Raises
     ------
     UsageError
         A fold that there is not, or without pictures.
     """
-    number, of = options.fold
+    number, of = fold
     if (number, of) == (0, 0):
-        return expert_pictures(Path(options.real)) if options.real else ()
-    if not (options.real and of >= 2 and 1 <= number <= of):
+        return expert_pictures(Path(real)) if real else ()
+    if not (real and of >= 2 and 1 <= number <= of):
         raise UsageError(f"fold {number}/{of}: must be 1/n .. n/n (n >= 2) of real pictures")
-    return folds(expert_pictures(Path(options.real)), number, of)[0]
+    return folds(expert_pictures(Path(real)), number, of)[0]
 
 
 def train(
@@ -263,7 +294,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
-    real = real_pictures(options)
+    real = real_pictures(options.real, options.fold)
     net = MaskUNet(MaskUNetConfig()).to(options.device).train()
     # channels_last only orders the memory; the stubs of Module.to do not know it
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

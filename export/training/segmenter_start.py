@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
 from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError
+from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.models import Session
+from gcar_deploy.types import Array
 from gcar_export.training.networks.mask_unet import MaskUNet
 
 _PREFIX = "net."
@@ -42,6 +47,31 @@ def begin_with(net: MaskUNet, path: Path) -> str:
         value[:rows] = given
     net.load_state_dict(own)
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+class _Own:
+    """Answers as ``models.Session`` does, with the segmenter's own word on devices."""
+
+    def __init__(self, net: MaskUNet) -> None:
+        self.net = net
+
+    def run(self, inputs: Mapping[str, Array], *_: object, **__: object) -> list[Array]:
+        with torch.no_grad():
+            vessel, chord, device = self.net(torch.from_numpy(inputs["channels"])).split(1, dim=1)
+        return [m.numpy() for m in (torch.sigmoid(vessel), chord, torch.sigmoid(device))]
+
+
+def frozen_segmenter(path: Path) -> Segmenter:
+    """Open the segmenter of a model or checkpoint as what a device network stands on.
+
+    Raises
+    ------
+    ModelError
+        As ``begin_with``.
+    """
+    net = MaskUNet()
+    begin_with(net, path)
+    return Segmenter(cast(Session, _Own(net.eval())))
 
 
 def _of_onnx(path: Path) -> dict[str, torch.Tensor]:

@@ -252,10 +252,10 @@ def test_folds_leave_each_picture_out_once(drawn):
         left_out += [p.name for p in held]
     assert left_out == [p.name for p in pictures]
     options = dataclasses.replace(TINY, real=str(drawn), fold=(2, 3))
-    assert len(real_pictures(options)) == len(folds(pictures, 2, 3)[0])
+    assert len(real_pictures(options.real, options.fold)) == len(folds(pictures, 2, 3)[0])
     for fold in ((0, 3), (4, 3), (1, 1)):
         with pytest.raises(UsageError, match="fold"):
-            real_pictures(dataclasses.replace(options, fold=fold))
+            real_pictures(options.real, fold)
     with pytest.raises(UsageError, match="must be K/N"):
         chosen("cpu", {"fold": "first"})
     with pytest.raises(ImageError, match=r"no N\.png"):
@@ -284,7 +284,7 @@ def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
 
 def test_a_step_holds_real_and_generated_pictures(drawn, tmp_path):
     options = dataclasses.replace(TINY, batch=4, real=str(drawn), real_share=0.5, crop=128)
-    stream = Stream(options, tmp_path, real_pictures(options))
+    stream = Stream(options, tmp_path, real_pictures(options.real, options.fold))
     known = [float(stream[k][1][4].mean()) for k in range(4)]
     assert max(known[:2]) < 0.5 < min(known[2:])  # of devices, real pictures tell little
     assert stream[0][0].shape == (3, 128, 128) and stream[3][1].shape == (6, 128, 128)

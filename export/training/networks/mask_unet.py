@@ -20,7 +20,9 @@ class MaskUNetConfig:
     width: tuple[int, ...] = (16, 32, 48, 96, 128)
 
 
-class _Pair(nn.Sequential):
+class Pair(nn.Sequential):
+    """Two convolutions, each with its norm."""
+
     def __init__(self, inside: int, out: int) -> None:
         # Statistics over one picture: the batch is small, and at run time it is one.
         super().__init__(
@@ -44,10 +46,10 @@ class MaskUNet(nn.Module):
         self.config = config or MaskUNetConfig()
         width = self.config.width
         self.down = nn.ModuleList(
-            _Pair(a, b) for a, b in zip((self.config.channels, *width[:-1]), width, strict=True)
+            Pair(a, b) for a, b in zip((self.config.channels, *width[:-1]), width, strict=True)
         )
         self.up = nn.ModuleList(
-            _Pair(a + b, b) for a, b in zip(width[:0:-1], width[-2::-1], strict=True)
+            Pair(a + b, b) for a, b in zip(width[:0:-1], width[-2::-1], strict=True)
         )
         self.head = nn.Conv2d(width[0], 3, 1)
         nn.init.constant_(self.head.bias, -2.5)  # vessels are some 7 % of a picture
