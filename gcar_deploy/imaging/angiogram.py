@@ -126,6 +126,8 @@ class VesselImage:
         What was taken for a catheter and left out of the mask; None where nobody looked.
     catheter_mm : float
         Length of its line.
+    device : (rows, cols) float32 or None
+        Probability of catheter, lead or wire; None where no network was asked.
     by_network : bool
         Whether the network's word is in it.
     """
@@ -141,11 +143,13 @@ class VesselImage:
     vesselness: Image | None = None
     catheter: Mask | None = None
     catheter_mm: float = 0.0
+    device: Image | None = None
     by_network: bool = False
     others: tuple[VesselImage, ...] = ()
 
     def __post_init__(self) -> None:
-        for array in (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter):
+        arrays = (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter, self.device)
+        for array in arrays:
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
 

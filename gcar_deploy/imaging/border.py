@@ -90,6 +90,7 @@ def put_back(found: VesselImage, angiogram: Angiogram, box: Box) -> VesselImage:
         valid=whole(found.valid),
         vesselness=None if found.vesselness is None else whole(found.vesselness),
         catheter=None if found.catheter is None else whole(found.catheter),
+        device=None if found.device is None else whole(found.device),
         others=tuple(put_back(other, angiogram, box) for other in found.others),
     )
 

@@ -308,6 +308,7 @@ def _from_grey(
         vesselness=found.vesselness,
         catheter=found.catheter if angiogram.mask is None else None,
         catheter_mm=found.catheter_mm,
+        device=found.device,
         by_network=segmenter is not None and angiogram.mask is None,
     )
 

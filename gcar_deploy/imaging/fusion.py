@@ -41,7 +41,7 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
             picture, ~learned.valid, either, np.where(learned.mask, learned.path_mm, 0),
             learned.carm.pixel_at_isocenter_mm,
         ),
-        others=(learned, classic),
+        others=(learned, dataclasses.replace(classic, device=learned.device)),
         catheter=_either(classic, learned, learned.mask),
         catheter_mm=max(classic.catheter_mm, learned.catheter_mm),
     )  # fmt: skip

@@ -18,6 +18,7 @@ from gcar_deploy.imaging import enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
+from gcar_deploy.imaging.device_lines import device_parts
 from gcar_deploy.imaging.net import NOMINAL_MM, Seen, Segmenter, at_network_size, net_input
 from gcar_deploy.types import Image, Mask
 
@@ -34,9 +35,9 @@ CONTRAST_SHARE = 0.1
 #: paths are averaged over so much of the line before they say where the rim is, and blurred by so
 #: much, pixels of the network
 _ALONG_PX, _BLUR_PX = 3.0, 0.7
-#: hysteresis on the probability of a device, and how long one is at least, pixels of the network
-DEVICE_LEVELS = (0.5, 0.8)
-DEVICE_PX = 30
+#: a line of one picture alone is left out where it is so probably a device, as long as no more than
+#: this share of the vessels' line goes
+ALONE_LEVEL, ALONE_SHARE = 0.92, 0.5
 
 
 def learned_vessels(
@@ -67,8 +68,8 @@ def learned_vessels(
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
     seen = segmenter.look(net_input(work, work_holes))
-    shaft = shafts(seen, work, work_holes)
-    other = work_holes | shaft | (seen.device > seen.probability)
+    device = devices(seen, work, work_holes)
+    other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]
     finer = float(np.sqrt(search.size / work.size))
@@ -81,32 +82,45 @@ def learned_vessels(
     path = np.where(near, contrast, np.float32(0))
     # A rim is best seen by both: chords end where an observer draws it, contrast is fine.
     mask = _drawn(np.where(near, 0.5 * (chord + contrast), np.float32(0)), near, finer)
-    device = (_devices(seen, sure) | shaft) & ~sure
+    device &= ~sure
     found = dataclasses.replace(
         segment.given(search, mask, holes, pixel_mm),
         vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
         catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~mask,
         catheter_mm=int(skel.skeletonize(device).sum()) * float(work_mm),
+        device=segment.resize(np.where(work_holes, np.float32(0), seen.device), full),
     )
     return found, path
 
 
-def shafts(seen: Seen, picture: Image, holes: Mask) -> Mask:
-    """(rows, cols) bool: lines of vessels and devices that are catheters, leads or wires by course.
+def devices(seen: Seen, picture: Image, holes: Mask) -> Mask:
+    """(rows, cols) bool: lines that are catheters, leads or wires.
 
-    The network takes parts of a catheter for a device and parts for a vessel: its course is that
-    of both together. Pixels are taken for as large as the network's filters take them.
+    By their course among the vessels, or by what the network says along vessels and devices
+    together: it takes parts of a catheter for a device and parts for a vessel. Pixels are taken for
+    as large as the network's filters take them.
     """
-    either = np.where(holes, np.float32(0), np.maximum(seen.probability, seen.device))
-    reach = skel.parts_touching(either >= LEVELS[0], either >= LEVELS[1])
-    line = skel.prune(skel.skeletonize(reach), either, SPUR_PX, 0.0)
+    vessel = np.where(holes, np.float32(0), seen.probability)
+    reach, line = _line(vessel)
     if not line.any():
         return np.zeros_like(reach)
     filled = enhance.fill_holes(picture, holes)
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / NOMINAL_MM)
     sigma_px = enhance.ridges(flat, NOMINAL_MM).sigma_px
-    taken = catheters(line, flat, sigma_px, ~holes, NOMINAL_MM)
-    return skel.beside_alone(reach, line, taken)
+    found = skel.beside_alone(reach, line, catheters(line, flat, sigma_px, ~holes, NOMINAL_MM))
+    reach, either = _line(np.where(holes, np.float32(0), np.maximum(vessel, seen.device)))
+    for part in device_parts(either, seen.device, ~holes, ALONE_LEVEL):
+        more = found | skel.beside_alone(reach, either, part)
+        # A small tree behind a long catheter may be taken for one with it.
+        if (more & line).sum() <= ALONE_SHARE * line.sum():
+            found = more
+    return found
+
+
+def _line(probability: Image) -> tuple[Mask, Mask]:
+    """(rows, cols) bool each: where a line is seen, and its centreline."""
+    reach = skel.parts_touching(probability >= LEVELS[0], probability >= LEVELS[1])
+    return reach, skel.prune(skel.skeletonize(reach), probability, SPUR_PX, 0.0)
 
 
 def support(seen: Seen, levels: tuple[float, float]) -> Mask:
@@ -131,16 +145,6 @@ def support(seen: Seen, levels: tuple[float, float]) -> Mask:
     if line.any():
         line = skel.strong_parts(line, deep, segment.PART_SHARE)
     return skel.beside(reach, whole, line)
-
-
-def _devices(seen: Seen, vessel: Mask) -> Mask:
-    """(rows, cols) bool: catheters, leads and wires that are longer than a speck."""
-    device = skel.parts_touching(seen.device >= DEVICE_LEVELS[0], seen.device >= DEVICE_LEVELS[1])
-    device &= ~vessel
-    _, label, stats, _ = cv2.connectedComponentsWithStats(device.astype(np.uint8))
-    long = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= DEVICE_PX
-    long[0] = False
-    return long[label]
 
 
 def _with_contrast(near: Mask, chord: Image, contrast: Image, finer: float) -> Mask:

@@ -5,7 +5,9 @@ ridge response of the classical method: three channels that look much alike in g
 pictures, whatever the display did to the grey values. It is told no pixel size: that is often
 unknown or wrong, so the scale has to be found in the picture. It answers how probably a pixel is
 vessel, how probably catheter, lead or wire, and how long the chord through vessel is there, in
-pixel edges: a vessel's width is in the picture, and a round vessel is as deep as it is wide.
+pixel edges: a vessel's width is in the picture, and a round vessel is as deep as it is wide. What
+is catheter, lead or wire a second network says, at half the resolution and within the same file:
+it is given the picture and the answers of the first.
 """
 
 from __future__ import annotations

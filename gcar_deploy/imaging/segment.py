@@ -53,6 +53,8 @@ class Segmentation:
         Lines taken for catheters, as wide as they look; no part of the mask.
     catheter_mm : float
         Their length.
+    device : (rows, cols) float32 or None
+        Probability of catheter, lead or wire; None where no network was asked.
     """
 
     mask: Mask
@@ -64,6 +66,7 @@ class Segmentation:
     contrast: float
     catheter: Mask
     catheter_mm: float
+    device: Image | None = None
 
 
 def segment(

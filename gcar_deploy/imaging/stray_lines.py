@@ -17,7 +17,9 @@ import numpy as np
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.border import inward_px
+from gcar_deploy.imaging.device_lines import device_parts
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
+from gcar_deploy.imaging.net import SIDE as NETWORK_SIDE
 from gcar_deploy.types import Mask
 
 #: so near to the border of the field a line comes from outside, mm
@@ -31,8 +33,8 @@ THROUGH_DEG, _WAY_MM = 25.0, 4.0
 def stray_lines(view: VesselImage) -> Iterator[Mask]:
     """Yield (rows, cols) bool parts of the view's skeleton that may be no vessel.
 
-    Parts beside the largest; what comes from the border, to its first fork; and the same line on
-    through forks as long as it goes straight.
+    Parts beside the largest; what comes from the border, or goes on from a device that was left
+    out, to its first fork; and the same line on through forks as long as it goes straight.
     """
     line = view.skeleton
     px = 1.0 / view.carm.pixel_at_isocenter_mm
@@ -41,13 +43,30 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
     yield from (label == k for k in range(1, count)
                 if k != size.argmax() and size[k] >= SHORTEST_MM * px)  # fmt: skip
     graph = LineGraph(line)
-    for end in graph.ends(line & (inward_px(view.valid) <= BORDER_MM * px)):
+    for end in graph.ends(line & _from_outside(view, px)):
         path, spurs = graph.walk(end, SPUR_MM * px, LONGEST_MM * px)
         if len(path) >= SHORTEST_MM * px:
             yield _drawn(line, [*path, *spurs])
         further = _straight_on(graph, path, px)
         if len(further) >= len(path) + SHORTEST_MM * px:
             yield _drawn(line, further)
+
+
+def _from_outside(view: VesselImage, px: float) -> Mask:
+    """Where a line may come from outside: near the border, or near a device that was left out."""
+    near = inward_px(view.valid) <= BORDER_MM * px
+    if view.catheter is None or not view.catheter.any():
+        return near
+    beside = cv2.distanceTransform((~view.catheter).astype(np.uint8), cv2.DIST_L2, 5)
+    return near | (beside <= BORDER_MM * px)
+
+
+def likely_devices(view: VesselImage, level: float) -> Iterator[Mask]:
+    """Yield (rows, cols) bool parts of the view's skeleton that are so probably a device."""
+    if view.device is None:
+        return
+    finer = math.sqrt(view.mask.size) / NETWORK_SIDE
+    yield from device_parts(view.skeleton, view.device, None, level, finer)
 
 
 def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:

@@ -2,67 +2,101 @@
 
 Two views of one tree hold the same vessel mass in every epipolar plane. A line that one view alone
 shows breaks that. So of the lines that may be no vessel (``imaging.stray_lines``) those are left
-out, one after the other, without which the views agree far better. Catheters that both views show
-agree as vessels do; they are for the segmentation to tell.
+out, one after the other, without which the views agree far better. What the network takes for a
+device goes already where they agree as well; so do two of them, one in each view, since a
+catheter that both show agrees as vessels do.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias
 
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.imaging.stray_lines import stray_lines, without_line
+from gcar_deploy.imaging.stray_lines import likely_devices, stray_lines, without_line
 from gcar_deploy.pose.pairwise import Pose
 
 #: each line that is left out lowers the disagreement to this share at least
 GAIN = 0.85
+#: a line from outside that is so probably a device, or a stretch of the tree that is so, goes
+#: where the views agree as well without it
+LIKELY, INSIDE, LIKELY_GAIN = 0.3, 0.8, 1.0
 #: at least this share of a view's line stays
 KEPT_SHARE = 0.5
 #: of a view's lines the longest are asked
 MOST_LINES = 8
+Views: TypeAlias = "Sequence[VesselImage]"
 
 
 def partnered(
     views: Sequence[VesselImage], poses: tuple[Pose, ...], asked: Sequence[bool], enough: float,
     estimate: Callable[[Sequence[VesselImage]], tuple[Pose, ...]],
 ) -> tuple[list[VesselImage], tuple[Pose, ...]]:  # fmt: skip
-    """Leave out lines that no other view shows, until the views agree well enough.
+    """Leave out likely devices, and lines that no other view shows until the views agree enough.
 
     Parameters
     ----------
     views : V vessel images
     poses : what ``estimate`` says of them
     asked : of each view whether its lines may be left out
-    enough : disagreement, 0 .. 1, from which on nothing more is asked
+    enough : disagreement, 0 .. 1, from which on only likely devices are asked
     estimate : poses of such views
 
     Returns
     -------
     views, poses : those that are not changed are the same objects
     """
-    now, reduced = list(views), functools.cache(_reduced)  # few views change from round to round
+    now = list(views)
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
-    while (worst := max(pose.after for pose in poses)) > enough:
-        tried = [
-            [*now[:k], fewer, *now[k + 1 :]]
-            for k, (view, few, may) in enumerate(zip(now, least, asked, strict=True))
-            if may
-            for fewer in reduced(view, few)
+    fewer_of = functools.cache(_fewer)  # few views change from round to round
+    while True:
+        worst = max(pose.after for pose in poses)
+        fewer = [
+            fewer_of(view, few) if may else ()
+            for view, few, may in zip(now, least, asked, strict=True)
         ]
+        likely = [[one for one, device in some if device] for some in fewer]
+        tried = [(each, LIKELY_GAIN) for each in (*_one_of(now, likely), *_two_of(now, likely))]
+        if worst > enough:
+            others = [[one for one, device in some if not device] for some in fewer]
+            tried += [(each, GAIN) for each in _one_of(now, others)]
         if not tried:
             break
-        found = [estimate(views) for views in tried]
-        after = [max(pose.after for pose in poses) for poses in found]
+        found = [estimate(each) for each, _ in tried]
+        after = [
+            max(pose.after for pose in some) / gain
+            for some, (_, gain) in zip(found, tried, strict=True)
+        ]
         best = after.index(min(after))
-        if after[best] > GAIN * worst:
+        if after[best] > worst:
             break
-        now, poses = tried[best], found[best]
+        now, poses = tried[best][0], found[best]
     return now, poses
 
 
-def _reduced(view: VesselImage, least_px: float) -> list[VesselImage]:
-    """Return the view without one of its lines, for each that leaves enough."""
+def _one_of(views: Views, instead: Sequence[Views]) -> Iterator[list[VesselImage]]:
+    """Yield the views with one replaced, for each that may stand ``instead`` of it."""
+    for k, some in enumerate(instead):
+        for one in some:
+            yield [*views[:k], one, *views[k + 1 :]]
+
+
+def _two_of(views: Views, instead: Sequence[Views]) -> Iterator[list[VesselImage]]:
+    """Yield the views with two of them replaced: what both show agrees as vessels do."""
+    for first in range(len(views)):
+        for once in _one_of(views, [s if k == first else () for k, s in enumerate(instead)]):
+            yield from _one_of(once, [s if k > first else () for k, s in enumerate(instead)])
+
+
+def _fewer(view: VesselImage, least_px: float) -> list[tuple[VesselImage, bool]]:
+    """Return the view without one of its lines, and if that is a likely device, for each."""
     lines = sorted(stray_lines(view), key=lambda line: -int(line.sum()))[:MOST_LINES]
-    left = [without_line(view, line) for line in lines]
-    return [one for one in left if one is not None and one.skeleton.sum() >= least_px]
+    lines += list(likely_devices(view, INSIDE))
+    found = []
+    for line in lines:
+        left = without_line(view, line)
+        if left is not None and left.skeleton.sum() >= least_px:
+            said = 0.0 if view.device is None else float(view.device[line].mean())
+            found.append((left, said >= LIKELY))
+    return found

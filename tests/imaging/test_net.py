@@ -44,7 +44,9 @@ def test_the_fusion_draws_what_the_network_draws_and_forgets_no_line(net):
     two = extract_vessels(picture, ImagingOptions(segmenter="net"), net)
     bright = bright_vessels(picture.pixels, "raw", True)[0]["display"]
     both = fused(one, two, bright)
-    assert both.others == (two, one)
+    alone, old = both.others
+    assert alone is two and old.mask is one.mask
+    assert both.device is old.device is two.device and one.device is None
     np.testing.assert_array_equal(both.mask, two.mask)
     assert (both.path_mm > 0)[(one.path_mm > 0.5) | (two.path_mm > 0.5)].mean() > 0.9
     assert not both.path_mm[(one.path_mm == 0) & (two.path_mm == 0)].any()

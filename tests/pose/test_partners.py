@@ -1,0 +1,70 @@
+"""Likely devices go where the views agree as well without them; vessels stay."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gcar_deploy.pose.partners import LIKELY, partnered
+from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, view_of
+
+AGREED, ENOUGH = 0.05, 0.1
+
+
+def crossed(said: float):
+    """A vessel and a line from the border to it, which the network calls so probably a device."""
+    left = CROSSING[0], slice(0, MIDDLE)
+    view = view_of(VESSEL, left)
+    device = np.zeros(view.mask.shape, np.float32)
+    device[CROSSING[0], : MIDDLE - 8] = said
+    return dataclasses.replace(view, device=device)
+
+
+def there(view) -> bool:
+    return bool(view.mask[CROSSING[0], 20].any())
+
+
+def poses(after: float):
+    return (SimpleNamespace(after=0.0), SimpleNamespace(after=after))
+
+
+def asked(said, after, may=(True, True)):
+    """Which of two views keep the line, where ``after`` says how well views with so many agree."""
+    views = [crossed(one) for one in said]
+
+    def estimate(tried):
+        return poses(after(*(there(view) for view in tried)))
+
+    kept, found = partnered(views, estimate(views), may, ENOUGH, estimate)
+    assert found[1].after == after(*(there(view) for view in kept))
+    return [there(view) for view in kept]
+
+
+SURE = min(1.0, LIKELY + 0.2)
+
+
+def test_a_likely_device_goes_where_the_views_agree_as_well_without_it():
+    assert asked((SURE, 0.0), lambda one, two: AGREED) == [False, True]
+    assert asked((SURE, 0.0), lambda one, two: AGREED, may=(False, True)) == [True, True]
+
+
+def test_it_stays_where_they_agree_less_without_it():
+    assert asked((SURE, 0.0), lambda one, two: AGREED if one else 1.2 * AGREED) == [True, True]
+
+
+def test_what_is_no_likely_device_is_not_asked_while_the_views_agree():
+    assert asked((0.5 * LIKELY, 0.0), lambda one, two: AGREED) == [True, True]
+    # where they do not, it has to help more than a likely one
+    worse = 2 * ENOUGH
+    assert asked((0.0, 0.0), lambda one, two: worse if one else 0.95 * worse) == [True, True]
+    assert asked((0.0, 0.0), lambda one, two: worse if one else 0.5 * worse) == [False, True]
+
+
+@pytest.mark.parametrize(("said", "kept"), [((SURE, SURE), False), ((SURE, 0.0), True)])
+def test_what_both_views_call_a_device_goes_though_they_agree_on_it(said, kept):
+    """A catheter that both show: without it in one of them alone, they agree less."""
+    found = asked(said, lambda one, two: AGREED if one == two else 2 * AGREED)
+    assert found == [kept, kept]
