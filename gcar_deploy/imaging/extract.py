@@ -241,6 +241,17 @@ def _from_drawn(angiogram: Angiogram, mask: Mask, least_mm: float = MIN_LENGTH_M
     )
 
 
+def by_width(view: VesselImage) -> VesselImage:
+    """Return the view with the chords of its mask for paths: its contrast is not believed."""
+    return dataclasses.replace(
+        view,
+        path_mm=mask_path(view.mask, view.carm.pixel_at_isocenter_mm),
+        path_error=MASK_ERROR,
+        kind="mask",
+        others=(),
+    )
+
+
 def above_half(pixels: Image) -> Mask:
     """Vessel of a picture that is a mask, binary or grey: above half of its largest value."""
     inside: Mask = pixels > 0.5 * float(pixels.max())

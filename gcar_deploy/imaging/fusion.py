@@ -10,6 +10,7 @@ import numpy as np
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.contrast import scaled_contrast
+from gcar_deploy.imaging.one_sided import one_sided
 from gcar_deploy.types import Image, Mask
 
 #: a line of the network's is on a device that lies so near, pixels each way
@@ -31,9 +32,26 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
 
     Returns
     -------
-    VesselImage ; its ``others`` are ``learned`` and ``classic``
+    VesselImage ; its ``others`` are ``learned`` and ``classic``, and where these hold lines that
+    stand out on one side alone, all three without them
     """
     classic, learned = _without(classic, learned.catheter), _without(learned, classic.catheter)
+    classic = dataclasses.replace(classic, device=learned.device)
+    others: tuple[VesselImage, ...] = (learned, classic)
+    less = tuple(_two_sided(view, picture) for view in others)
+    if any(a is not b for a, b in zip(less, others, strict=True)):
+        others += (_both(less[1], less[0], picture), *less)
+    return dataclasses.replace(_both(classic, learned, picture), others=others)
+
+
+def _two_sided(view: VesselImage, picture: Image) -> VesselImage:
+    rims = one_sided(
+        view.skeleton, view.path_mm > 0, picture, ~view.valid, view.carm.pixel_at_isocenter_mm
+    )
+    return _without(view, rims)
+
+
+def _both(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselImage:
     either = (classic.path_mm > 0) | (learned.path_mm > 0)
     return dataclasses.replace(
         learned,
@@ -41,7 +59,6 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
             picture, ~learned.valid, either, np.where(learned.mask, learned.path_mm, 0),
             learned.carm.pixel_at_isocenter_mm,
         ),
-        others=(learned, dataclasses.replace(classic, device=learned.device)),
         catheter=_either(classic, learned, learned.mask),
         catheter_mm=max(classic.catheter_mm, learned.catheter_mm),
     )  # fmt: skip

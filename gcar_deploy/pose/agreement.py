@@ -12,6 +12,7 @@ import numpy as np
 from gcar_deploy.config import PoseOptions, RunOptions
 from gcar_deploy.geometry.consistency import Mass, disagreement, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import by_width
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
@@ -22,62 +23,120 @@ from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
 
+#: readings of two views, of those that agree best as they stand, whose correction is estimated
+READINGS = 4
+#: of the further readings of a view the first are what each method sees
+METHODS = 2
+
 
 def agreeing(
     angiograms: Sequence[Angiogram], views: Sequence[VesselImage], options: RunOptions
 ) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
     """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
 
-    First from what the network alone sees, where the classical method followed lines that have no
-    counterpart; then without lines that no other view shows (``partners``). Nothing of a mask that
-    the user gave is left out.
+    First from what one method sees of all views, where the other followed lines that have no
+    counterpart; then without lines that no other view shows (``partners``). Where they contradict
+    each other still, the same from any reading of either view, and then from widths alone. Nothing
+    of a mask that the user gave is left out.
 
     Returns
     -------
-    views : as given, what the network alone sees of them, or without some of their lines
+    views : as given, or a reading of them, or without some of their lines
     poses : one per view
-    findings : that lines were left out, which makes the result ``degraded``
+    findings : that lines were left out, or depth is told by widths: the result is ``degraded``
     """
-    views, poses = _alone_if_closer(views, options)
     asked = [
         not (view.calibrated or view.kind == "mask" or angiogram.mask is not None)
         for angiogram, view in zip(angiograms, views, strict=True)
     ]
-    enough = options.quality.parts_disagreement_raw
+    limits = options.quality
 
     def estimate(tried: Sequence[VesselImage]) -> tuple[Pose, ...]:
         return poses_between(tried, options)
 
-    fewer, closer = partnered(views, poses, asked, enough, estimate)
+    seen: Sequence[VesselImage] = views
+    first = poses = estimate(views)
+    for readings in (_by_method, _likeliest):
+        seen, poses = _closest(seen, poses, readings(views, first, options), options)
+        fewer, closer = partnered(seen, poses, asked, limits.parts_disagreement_raw, estimate)
+        if max(p.after for p in closer) <= limits.good_disagreement_raw:
+            return fewer, closer, _left_out(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.
-    if max(p.after for p in closer) > options.quality.good_disagreement_raw:
-        return list(views), poses, []
-    findings = [
+    return _by_width(views, asked, options) or (list(seen), poses, [])
+
+
+def _left_out(fewer: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[str]:
+    return [
         f"view {one.view_id}: {1 - one.mask.sum() / view.mask.sum():.0%} of what looks like vessel "
         "has no counterpart in the other views: left out as catheter, lead or background"
         for one, view in zip(fewer, views, strict=True)
         if one is not view
     ]
-    return fewer, closer, findings
 
 
-def _alone_if_closer(
-    views: Sequence[VesselImage], options: RunOptions
-) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:
-    poses = poses_between(views, options)
-    worst = max(p.after for p in poses)
-    limits = options.quality
+def _by_width(
+    views: Sequence[VesselImage], asked: Sequence[bool], options: RunOptions
+) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]] | None:
+    """Take depth from widths where contrasts contradict each other; None where widths do too.
+
+    Contrast fails where a display cuts off the darkest grey values, and in front of what is as
+    dark as a vessel; the outlines may be right all the same.
+    """
+    drawn = [by_width(view) if may else view for view, may in zip(views, asked, strict=True)]
+    poses = poses_between(drawn, options)
+    if not any(asked) or max(p.after for p in poses) > options.quality.good_disagreement_mask:
+        return None
+    ids = " and ".join(view.view_id for view, may in zip(views, asked, strict=True) if may)
+    said = f"view {ids}: contrasts contradict each other; depth is taken from the widths of vessels"
+    return drawn, poses, [said]
+
+
+def _closest(
+    views: Sequence[VesselImage], poses: tuple[Pose, ...],
+    readings: Sequence[Sequence[VesselImage]], options: RunOptions,
+) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:  # fmt: skip
+    """Take the first reading that agrees far better than all before it, if any."""
+    limits, worst = options.quality, max(p.after for p in poses)
     if worst <= limits.alone_disagreement_raw:
         return views, poses
-    fusions = views
-    for k in range(max(len(view.others) for view in fusions)):
-        alone = [view.others[k] if k < len(view.others) else view for view in fusions]
-        closer = poses_between(alone, options)
+    for read in readings:
+        closer = poses_between(read, options)
         after = max(p.after for p in closer)
         if limits.alone_ratio * after < worst:
-            _log.info("the views agree better by what method %d of the fusion alone sees", k + 1)
-            views, poses, worst = alone, closer, after
+            _log.info("the views agree better by what one method sees of them, or without rims")
+            views, poses, worst = read, closer, after
     return views, poses
+
+
+def _by_method(
+    views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
+) -> list[list[VesselImage]]:
+    """Return what the network sees of all views, and what the classical method does."""
+    most = min(METHODS, max(len(view.others) for view in views))
+    return [
+        [view.others[k] if k < len(view.others) else view for view in views] for k in range(most)
+    ]
+
+
+def _likeliest(
+    views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
+) -> list[list[VesselImage]]:
+    """Return the readings of two views that agree best where these stand now."""
+    readings = [(view, *view.others) for view in views]
+    if len(views) != 2 or max(map(len, readings)) == 1:
+        return []
+    masses = [profiled(own, options)[0] for own in readings]
+    fine_mm = _smoothing(views, options).fine_mm
+
+    def apart(pair: tuple[int, ...]) -> float:
+        fixed, moving = masses[0][pair[0]], masses[1][pair[1]]
+        if fixed is None or moving is None:
+            return 1.0
+        return disagreement(fixed, moving, poses[1].applied(moving.carm), fine_mm)
+
+    pairs = itertools.product(*(range(len(own)) for own in readings))
+    order = sorted(pairs, key=apart)[:READINGS]
+    return [[own[k] for own, k in zip(readings, pair, strict=True)] for pair in order]
 
 
 def poses_between(

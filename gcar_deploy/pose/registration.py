@@ -94,7 +94,8 @@ def register(
     Registered
         Also of views that contradict each other: ``or_refuse`` raises then.
     """
-    views, poses, findings = agreeing(angiograms, views, options)
+    given = views
+    views, poses, findings = agreeing(angiograms, given, options)
     rigid = bundled(views, poses, tree_of, options)
     order, hint = order_of(views, rigid, options)
     findings += order
@@ -120,12 +121,28 @@ def register(
             findings += check_consistency(views, after, options.quality, partners)
     except RefusedError as error:
         refusal = str(error)
+    by_width = any(new.kind != old.kind for new, old in zip(views, given, strict=True))
     return Registered(
         views=tuple(posed(view, pose) for view, pose in zip(views, poses, strict=True)),
         poses=poses,
         findings=tuple(findings),
         hint=hint,
-        refusal=refusal,
+        refusal=refusal or (_two_contradictions(poses) if by_width else ""),
+    )
+
+
+def _two_contradictions(poses: Sequence[Pose]) -> str:
+    """Say why views are refused whose contrasts contradict each other, and outlines do, too.
+
+    Of pictures of two patients outlines may agree by chance, but hardly where vessels turn and end.
+    """
+    moved = max(pose.motion_mm for pose in poses)
+    if moved == 0:
+        return ""
+    return (
+        "the views contradict each other: in the contrasts of their vessels, and by "
+        f"{moved:.1f} mm (root mean square) in where these turn and end; different patients, "
+        "frames or angles?"
     )
 
 

@@ -95,3 +95,18 @@ def test_a_mask_is_never_emptied():
     vessel = drawn(VESSEL)
     both = fused(seen(drawn(SHAFT), vessel), seen(vessel, np.zeros_like(vessel)), picture(vessel))
     assert both.mask.sum() == vessel.sum()
+
+
+def test_lines_that_stand_out_on_one_side_are_left_out_of_further_readings():
+    vessel, rim = drawn(((90, 10), (90, 118))), drawn(((30, 10), (30, 118)))
+    step = np.repeat((np.arange(SIDE) < 31)[None], SIDE, axis=0)
+    ground = (0.2 * vessel + 0.3 * cv2.GaussianBlur(step.astype(np.float32), (0, 0), 1.0)).astype(
+        np.float32
+    )
+    none = np.zeros_like(vessel)
+    both = fused(seen(vessel | rim, none), seen(vessel, none), ground)
+    learned, classic, less, learned_less, classic_less = both.others
+    assert classic.mask[60, 30] and not classic_less.mask[60, 30] and classic_less.mask[60, 90]
+    assert learned_less is learned and both.path_mm[:, :40].any()
+    assert not less.path_mm[:, :40].any() and less.path_mm[60, 90] > 0
+    assert len(fused(seen(vessel, none), seen(vessel, none), ground).others) == 2

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from gcar_deploy.config import PoseOptions, RunOptions
@@ -41,6 +42,23 @@ def test_two_trees_are_refused_when_asked_with_what_was_measured():
     assert placed.disagreement > OPTIONS.quality.max_disagreement
     with pytest.raises(RefusedError, match="contradict"):
         placed.or_refuse()
+
+
+def test_outlines_of_two_trees_that_agree_by_chance_are_refused_by_where_vessels_end():
+    angiograms, views = pair(seeds=(4, 9), stranger=True)
+    placed = register(angiograms, views, OPTIONS, never)
+    assert {view.kind for view in placed.views} == {"mask"} and placed.poses[1].motion_mm > 0
+    assert placed.disagreement < OPTIONS.quality.good_disagreement_mask
+    with pytest.raises(RefusedError, match=r"contrasts.*turn and end; different patients"):
+        placed.or_refuse()
+    one = pair()[1]
+    across = np.exp(2.0 * np.linspace(-1, 1, 192))[None]
+    spoilt = [
+        dataclasses.replace(view, path_mm=(view.path_mm * by).astype(np.float32))
+        for view, by in zip(one, (across, 1 / across), strict=True)
+    ]
+    placed = register(pair()[0], spoilt, OPTIONS, never)
+    assert {view.kind for view in placed.views} == {"mask"} and placed.refusal == ""
 
 
 def test_a_refusal_says_that_the_pictures_may_be_swapped():
