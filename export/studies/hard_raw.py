@@ -32,7 +32,7 @@ from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import random_tree, rough_style, thin_style
 from gcar_export.studies.wrong_scenes import SIDES
 
-SEED = 81_020
+SEED = 81_030
 NEAR_MM = 1.5
 #: standard deviation of each angle of a view, deg
 SPREAD_DEG = 12.0

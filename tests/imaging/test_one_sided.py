@@ -63,3 +63,15 @@ def test_each_stretch_between_forks_is_judged_by_itself():
     told = found(picture, line)
     assert told[50:150, RIM].all() and told[170:270, RIM].all()
     assert not told[:, RIM + 10 :].any()
+
+
+@pytest.mark.parametrize(("height", "rim"), [(0.25, True), (0.5, True), (1.2, False)])
+def test_a_line_on_a_step_is_a_rim_by_its_rise_above_the_higher_side(height, rim):
+    """Above a step of height 1 its rise is ``height`` to one side and ``height + 1`` to the other.
+
+    The share is that of the lower rise in their mean: 0.33 and 0.5 lie below the limit, 0.71 above.
+    """
+    x = (COLUMNS - VESSEL) * PIXEL_MM
+    step = (COLUMNS < VESSEL).astype(np.float32)
+    picture = step + np.where(np.abs(x) <= 1.2, height + (COLUMNS >= VESSEL), 0)
+    assert found(np.asarray(picture, np.float32), line_at(VESSEL)).any() == rim

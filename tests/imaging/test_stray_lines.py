@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -71,3 +73,14 @@ def test_without_the_line_its_vessel_is_whole() -> None:
     assert left.mask[VESSEL].mean() > 0.95
     assert left.catheter[62, 20] and not left.catheter[100, MIDDLE]
     assert without_line(view, view.skeleton) is None
+
+
+def test_what_goes_on_from_a_device_that_was_left_out_is_asked() -> None:
+    """The branch ends in the field; a device goes on from there, or lies elsewhere."""
+    view = view_of(VESSEL, BRANCH)
+    beyond, elsewhere = np.zeros((2, SIDE, SIDE), bool)
+    beyond[BRANCH[0], SIDE - 38 :] = True
+    elsewhere[60:65, SIDE - 38 :] = True
+    assert list(stray_lines(dataclasses.replace(view, catheter=elsewhere))) == []
+    line = next(stray_lines(dataclasses.replace(view, catheter=beyond)))
+    assert covers(line, BRANCH) > 0.9 and not line[:100].any()
