@@ -28,6 +28,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Points
 from gcar_export.scenes.cine import CinePair, cine_pair
+from gcar_export.studies.pair_rows import Judged, head, row
 
 SEED, FRAMES = 7_400, 8
 NEAR_MM = 2.0
@@ -84,7 +85,7 @@ def shares(found: Points, true: Points) -> tuple[float, float]:
     return float(theirs.mean()), float(ours.mean())
 
 
-def judged(seed: int, patients: int) -> Iterator[tuple[str, float, float, str]]:
+def judged(seed: int, patients: int) -> Iterator[tuple[str, *Judged]]:
     """Yield which picture, share of the true line found, share of ours that is true, status."""
     engine = Engine()
     for number in range(patients):
@@ -103,27 +104,11 @@ def judged(seed: int, patients: int) -> Iterator[tuple[str, float, float, str]]:
             yield name, *shares(np.concatenate(lines), true), result.status
 
 
-def table(rows: Sequence[tuple[str, float, float, str]]) -> str:
+def table(rows: Sequence[tuple[str, *Judged]]) -> str:
     """Markdown: one line for the pictures as shown, one for the oracle."""
-    out = [
-        f"| pictures | pairs | true line found within {NEAR_MM:g} mm % | ours that is true % "
-        "| F %, refused 0 | ok / degraded / refused | least F of an ok % |",
-        "|---" * 7 + "|",
-    ]
-    for name in (AS_SHOWN, ERASED):
-        own = [row for row in rows if row[0] == name]
-        found, ours = np.array([row[1:3] for row in own]).T
-        made = np.array([row[3] != "refused" for row in own])
-        both = 200 * found * ours / np.maximum(found + ours, 1e-9)
-        states = [row[3] for row in own]
-        counts = " / ".join(str(states.count(s)) for s in ("ok", "degraded", "refused"))
-        sure = [f for f, state in zip(both, states, strict=True) if state == "ok"]
-        least = f"{min(sure):.1f}" if sure else "-"
-        out.append(
-            f"| {name} | {len(own)} | {100 * found[made].mean():.1f} | "
-            f"{100 * ours[made].mean():.1f} | {both.mean():.1f} | {counts} | {least} |"
-        )
-    return "\n".join(out)
+    names = (AS_SHOWN, ERASED)
+    out = [row(name, [own[1:] for own in rows if own[0] == name]) for name in names]
+    return "\n".join([head("pictures", NEAR_MM), *out])
 
 
 def main() -> None:

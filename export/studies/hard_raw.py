@@ -30,6 +30,7 @@ from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import RawOptions, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import random_tree, rough_style, thin_style
+from gcar_export.studies.pair_rows import Judged, head, row
 from gcar_export.studies.wrong_scenes import SIDES
 
 SEED = 81_030
@@ -38,6 +39,7 @@ NEAR_MM = 1.5
 SPREAD_DEG = 12.0
 #: tree ``k + OTHER`` is the other patient; as many apart as to be of the same side
 OTHER = 1000
+ONE, TWO = "one patient", "two patients"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -85,13 +87,13 @@ def raw_pair(seed: int, number: int) -> RawPair:
     return RawPair((one, two), grid, line)
 
 
-def judged(seed: int, pairs: int) -> Iterator[tuple[str, float, float, str]]:
+def judged(seed: int, pairs: int) -> Iterator[tuple[str, *Judged]]:
     """Yield which pair, share of the true line found, share of ours that is true, and status."""
     engine = Engine()
     for number in range(pairs):
         pair = raw_pair(seed, number)
         stranger = raw_pair(seed, number + OTHER).angiograms[1]
-        asked = (("one patient", pair.angiograms[1]), ("two patients", stranger))
+        asked = ((ONE, pair.angiograms[1]), (TWO, stranger))
         for name, second in asked:
             try:
                 result = engine.reconstruct([pair.angiograms[0], second], pair.grid)
@@ -104,25 +106,11 @@ def judged(seed: int, pairs: int) -> Iterator[tuple[str, float, float, str]]:
             yield name, float(found.mean()), float(ours.mean()), result.status
 
 
-def table(rows: Sequence[tuple[str, float, float, str]]) -> str:
+def table(rows: Sequence[tuple[str, *Judged]]) -> str:
     """Markdown: one line per kind of pair."""
-    out = [
-        f"| pictures of | pairs | true line found within {NEAR_MM:g} mm % | ours that is true % "
-        "| F %, refused 0 | ok / degraded / refused | least F of an ok % |",
-        "|---" * 7 + "|",
-    ]
-    for name in dict.fromkeys(row[0] for row in rows):
-        own = [row for row in rows if row[0] == name]
-        found, ours = np.array([row[1:3] for row in own]).T
-        both = 200 * found * ours / np.maximum(found + ours, 1e-9)
-        states = [row[3] for row in own]
-        counts = " / ".join(str(states.count(s)) for s in ("ok", "degraded", "refused"))
-        sure = [f for f, state in zip(both, states, strict=True) if state == "ok"]
-        figures = [f"{100 * found.mean():.1f}", f"{100 * ours.mean():.1f}", f"{both.mean():.1f}"]
-        if name != "one patient":
-            figures = ["-"] * 3
-        least = f"{min(sure):.1f}" if sure else "-"
-        out.append(f"| {name} | {len(own)} | {' | '.join(figures)} | {counts} | {least} |")
+    out = [head("pictures of", NEAR_MM)]
+    for name in dict.fromkeys(own[0] for own in rows):
+        out.append(row(name, [own[1:] for own in rows if own[0] == name], known=name == ONE))
     return "\n".join(out)
 
 

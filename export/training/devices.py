@@ -32,7 +32,7 @@ from gcar_export.scenes.device_pictures import (
 from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.run_folder import ProgressLine, RunFolder
-from gcar_export.training.segmenter import fold_of, learning_rate, real_pictures
+from gcar_export.training.segmenter import changes, learning_rate, real_pictures
 from gcar_export.training.segmenter_start import frozen_segmenter
 
 #: pictures of this seed are for choosing, never for training
@@ -78,25 +78,9 @@ TINY = DeviceOptions(
 
 
 def chosen(given: Mapping[str, Any]) -> DeviceOptions:
-    """Return the options with others in place of some; ``fold`` as ``K/N``, paths as such.
-
-    Raises
-    ------
-    UsageError
-        A fold that is not two numbers.
-    """
-    changed = dict(given)
-    if "fold" in changed:
-        changed["fold"] = fold_of(str(changed["fold"]))
-    if "real" in changed:
-        changed["real"] = str(changed["real"])
-    options = dataclasses.replace(DeviceOptions(), **changed)
-    # A run that was made shorter decays and warms up within itself.
-    return dataclasses.replace(
-        options,
-        decay_steps=min(options.decay_steps, options.steps),
-        warmup_steps=max(1, min(options.warmup_steps, options.steps // 4)),
-    )
+    """Return the options with others in place of some; see ``segmenter.changes``."""
+    options = DeviceOptions()
+    return dataclasses.replace(options, **changes(options, given))
 
 
 def asked_at_half(device: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -98,25 +98,29 @@ TINY = SegmenterOptions(
 
 
 def chosen(preset: str, given: Mapping[str, Any]) -> SegmenterOptions:
-    """Return a preset's options with others in place of some; ``fold`` as ``K/N``, paths as such.
+    """Return a preset's options with others in place of some; see ``changes``."""
+    options = PRESETS[preset]
+    return dataclasses.replace(options, **changes(options, given))
+
+
+def changes(options: Schedule, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what changes in the options of a training with these; ``fold`` as ``K/N``.
 
     Raises
     ------
     UsageError
         A fold that is not two numbers.
     """
-    changed = dict(given)
-    if "fold" in changed:
-        changed["fold"] = fold_of(str(changed["fold"]))
-    if "real" in changed:
-        changed["real"] = str(changed["real"])
-    options = dataclasses.replace(PRESETS[preset], **changed)
+    out = dict(given)
+    if "fold" in out:
+        out["fold"] = fold_of(str(out["fold"]))
+    if "real" in out:
+        out["real"] = str(out["real"])
+    steps = out.get("steps", options.steps)
     # A run that was made shorter decays and warms up within itself.
-    return dataclasses.replace(
-        options,
-        decay_steps=min(options.decay_steps, options.steps),
-        warmup_steps=max(1, min(options.warmup_steps, options.steps // 4)),
-    )
+    out["decay_steps"] = min(out.get("decay_steps", options.decay_steps), steps)
+    out["warmup_steps"] = max(1, min(out.get("warmup_steps", options.warmup_steps), steps // 4))
+    return out
 
 
 def fold_of(text: str) -> tuple[int, int]:

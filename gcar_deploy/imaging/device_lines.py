@@ -64,10 +64,9 @@ def device_parts(
 
 def _to_fork(part: Mask, line: Mask, finer: float) -> Mask:
     """Part with what is left of its line to the next fork, if that is hardly any."""
-    forks = cv2.dilate((line & (skel.neighbours(line) >= 3)).astype(np.uint8), _BLOCK) > 0
-    count, label = cv2.connectedComponents((line & ~forks).astype(np.uint8), connectivity=8)
-    left = np.bincount(label[line & ~forks & ~part], minlength=count)
-    mine = np.bincount(label[part & ~forks], minlength=count) > 0
+    count, label = skel.stretches(line)
+    left = np.bincount(label[line & ~part], minlength=count)
+    mine = np.bincount(label[part], minlength=count) > 0
     short = mine & (left <= STUB_PX * finer)
     short[0] = False
     return part | short[label]

@@ -38,17 +38,14 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
     classic, learned = _without(classic, learned.catheter), _without(learned, classic.catheter)
     classic = dataclasses.replace(classic, device=learned.device)
     others: tuple[VesselImage, ...] = (learned, classic)
-    less = tuple(_two_sided(view, picture) for view in others)
+    rims = one_sided(
+        [(view.skeleton, view.path_mm > 0) for view in others], picture, ~learned.valid,
+        learned.carm.pixel_at_isocenter_mm,
+    )  # fmt: skip
+    less = tuple(_without(view, rim) for view, rim in zip(others, rims, strict=True))
     if any(a is not b for a, b in zip(less, others, strict=True)):
         others += (_both(less[1], less[0], picture), *less)
     return dataclasses.replace(_both(classic, learned, picture), others=others)
-
-
-def _two_sided(view: VesselImage, picture: Image) -> VesselImage:
-    rims = one_sided(
-        view.skeleton, view.path_mm > 0, picture, ~view.valid, view.carm.pixel_at_isocenter_mm
-    )
-    return _without(view, rims)
 
 
 def _both(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselImage:

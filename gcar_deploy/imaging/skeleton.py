@@ -62,6 +62,18 @@ def neighbours(skeleton: Mask) -> Array:
     return cv2.filter2D(skeleton.astype(np.uint8), -1, _RING, borderType=cv2.BORDER_CONSTANT)
 
 
+def stretches(skeleton: Mask) -> tuple[int, Array]:
+    """Label the lines between forks from 1 on; a fork and what touches it belong to none.
+
+    Returns
+    -------
+    count : int, of numbers, 0 with them
+    label : (rows, cols) int32, 0 beside the lines
+    """
+    forks = cv2.dilate((skeleton & (neighbours(skeleton) >= 3)).astype(np.uint8), _BLOCK) > 0
+    return cv2.connectedComponents((skeleton & ~forks).astype(np.uint8), connectivity=8)
+
+
 def prune(
     skeleton: Mask, strength: Image, shortest_px: float, weakest: float, passes: int = 3
 ) -> Mask:

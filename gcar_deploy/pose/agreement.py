@@ -57,7 +57,10 @@ def agreeing(
     seen: Sequence[VesselImage] = views
     first = poses = estimate(views)
     for readings in (_by_method, _likeliest):
-        seen, poses = _closest(seen, poses, readings(views, first, options), options)
+        tried = seen
+        seen, poses = _closest(tried, poses, readings(views, first, options), options)
+        if seen is tried and readings is _likeliest:
+            break
         fewer, closer = partnered(seen, poses, asked, limits.parts_disagreement_raw, estimate)
         if max(p.after for p in closer) <= limits.good_disagreement_raw:
             return fewer, closer, _left_out(fewer, seen)

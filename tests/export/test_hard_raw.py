@@ -30,5 +30,5 @@ def test_refused_pairs_count_nothing_and_strangers_have_no_score():
     first, second = table(rows).splitlines()[2:]
     cells = [cell.strip() for cell in first.split("|")[1:-1]]
     assert cells[4:] == ["33.3", "1 / 0 / 1", "66.7"]
-    assert float(cells[2]) == pytest.approx(25.0)
+    assert float(cells[2]) == pytest.approx(50.0)
     assert "0 / 1 / 1" in second and second.count("| -") == 4

@@ -32,7 +32,8 @@ def scene(noise=0.0, slope=0.0):
 
 def found(picture, line, holes=NO_HOLES):
     reach = cv2.dilate(line.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    return one_sided(line, reach, picture, holes, PIXEL_MM)
+    (rims,) = one_sided([(line, reach)], picture, holes, PIXEL_MM)
+    return rims
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])

@@ -1,0 +1,38 @@
+"""Rows of a table of pairs: how much of the line is found, how much is true, which statuses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+#: share of the true line found, share of ours that is true, status (``refused``: both 0)
+Judged = tuple[float, float, str]
+
+
+def head(first: str, near_mm: float) -> str:
+    """Head of the table, Markdown; ``first`` names the pictures."""
+    names = (
+        first, "pairs", f"true line found within {near_mm:g} mm %", "ours that is true %",
+        "F %, refused 0", "ok / degraded / refused", "least F of an ok %",
+    )  # fmt: skip
+    return f"| {' | '.join(names)} |\n" + "|---" * len(names) + "|"
+
+
+def row(name: str, judged: Sequence[Judged], *, known: bool = True) -> str:
+    """Line of the table; the shares are means over all pairs that were not refused.
+
+    With ``known`` false there is no true line: statuses alone.
+    """
+    states = [status for *_, status in judged]
+    found, ours = np.array([shares for *shares, _ in judged]).T
+    both = 200 * found * ours / np.maximum(found + ours, 1e-9)
+    made = np.array([status != "refused" for status in states])
+    figures = ["-"] * 3
+    if known:
+        shown = (100 * share[made].mean() if made.any() else 0.0 for share in (found, ours))
+        figures = [*(f"{value:.1f}" for value in shown), f"{both.mean():.1f}"]
+    counts = " / ".join(str(states.count(s)) for s in ("ok", "degraded", "refused"))
+    sure = [f for f, status in zip(both, states, strict=True) if status == "ok"]
+    least = f"{min(sure):.1f}" if sure else "-"
+    return f"| {name} | {len(judged)} | {' | '.join(figures)} | {counts} | {least} |"
