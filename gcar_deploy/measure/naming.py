@@ -171,7 +171,8 @@ def readings(tree: Tree, own: Array) -> list[Reading]:
         reach = _Reach.of(ways)
         # A lone line has no side branch to be told by.
         if len(own) > 2:
-            out += [_right(way, ways, calibre, whole) for way in _beginnings(ways)]
+            found = (_right(way, ways, calibre, whole) for way in _beginnings(ways))
+            out += [reading for reading in found if reading is not None]
         out += [
             reading
             for a in ways
@@ -182,8 +183,8 @@ def readings(tree: Tree, own: Array) -> list[Reading]:
 
 
 def possible(side: str, figures: Scalars) -> bool:
-    """Whether a reading keeps the rules of its side."""
-    low, high = RULES[side]
+    """Whether a reading keeps the rules of its side, as far as its first figures tell."""
+    low, high = RULES[side][:, : len(figures)]
     return bool(((figures >= low) & (figures <= high)).all())
 
 
@@ -250,7 +251,7 @@ class _Reach:
 
 
 def _left(a: Route, c: Route, reach: _Reach, calibre: float, whole: float) -> Reading | None:
-    """Read two ways as LAD and LCx; None without a common trunk, or if the LAD ends too high."""
+    """Read two ways as LAD and LCx; None without a common trunk, or against a rule."""
     lower = (c.points_mm[-1, 2] - a.points_mm[-1, 2]) / 20.0
     if lower < _LEAST_LOWER:
         # Most pairs end here: two ways are read either way round.
@@ -260,21 +261,26 @@ def _left(a: Route, c: Route, reach: _Reach, calibre: float, whole: float) -> Re
     lad, lcx = a.length_mm - trunk, c.length_mm - trunk
     if not shared or trunk > MOST_TRUNK_MM or min(lad, lcx) < LEAST_WAY_MM:
         return None
+    fork, near_a = a.at(np.array([trunk, trunk + _NEAR_MM]))
+    near_c = c.at(np.array(trunk + _NEAR_MM))
+    to = np.array([a.points_mm[-1], c.points_mm[-1], near_a, near_c, a.points_mm[0]])
+    steps = to - fork
+    steps[-1] *= -1.0
+    directions = _directions(steps)
+    if not possible("left", directions):
+        return None
     names = dict.fromkeys(a.branches[:shared], "LM")
     names |= dict.fromkeys(a.branches[shared:], "LAD")
     names |= dict.fromkeys(c.branches[shared:], "LCx")
-    fork, ostium = a.at(np.array(trunk)), a.points_mm[0]
-    near_a, near_c = (way.at(np.array(trunk + _NEAR_MM)) for way in (a, c))
     r_trunk = a.mean_radius(0.0, trunk)
     r_lad, r_lcx = (way.mean_radius(trunk, trunk + _NEAR_MM) for way in (a, c))
     longest = reach.longest_mm
     own_a = a.points_mm[-1] @ np.array([0.0, -0.7, -0.7])
     figures = [
-        *_unit(a.points_mm[-1] - fork), *_unit(c.points_mm[-1] - fork),
-        *_unit(near_a - fork), *_unit(near_c - fork), *_unit(fork - ostium),
+        *directions,
         np.log(max(trunk, 1.0)), np.log(a.length_mm / longest), np.log(c.length_mm / longest),
         np.log(2 * r_trunk / (r_lad + r_lcx)), np.log(r_lad / r_lcx), calibre,
-        np.linalg.norm(a.points_mm[-1] - fork) / lad, np.linalg.norm(c.points_mm[-1] - fork) / lcx,
+        np.linalg.norm(steps[0]) / lad, np.linalg.norm(steps[1]) / lcx,
         (reach.to_apex_mm - own_a) / 20.0, (reach.to_back_mm - c.points_mm[-1, 1]) / 20.0,
         (trunk + lad + lcx) / whole, lower,
     ]  # fmt: skip
@@ -291,13 +297,17 @@ def _shared(a: Route, b: Route) -> int:
     return shared
 
 
-def _right(way: Route, ways: list[Route], calibre: float, whole: float) -> Reading:
-    """Read one way as RCA."""
-    off = [other.length_mm - other.node_arc_mm[_shared(way, other)] for other in ways]
+def _right(way: Route, ways: list[Route], calibre: float, whole: float) -> Reading | None:
+    """Read one way as RCA; None if it runs against a rule."""
     length = way.length_mm
     places = way.at(_PARTS * length)
+    directions = _directions(places[1:] - places[:-1])
+    if not possible("right", directions):
+        # Most ways end here, and their directions cost least.
+        return None
+    off = [other.length_mm - other.node_arc_mm[_shared(way, other)] for other in ways]
     figures = [
-        *np.concatenate([_unit(step) for step in np.diff(places, axis=0)]),
+        *directions,
         np.log(length), np.linalg.norm(places[-1] - places[0]) / length, calibre,
         np.log(way.mean_radius(0.5 * length, length) / way.mean_radius(0.0, 0.5 * length)),
         length / whole, max(off) / length,
@@ -320,6 +330,8 @@ def _contradicting(tree: Tree, names: list[BranchName | None]) -> bool:
     return len(middle) == 2 and middle["left"] <= middle["right"]
 
 
-def _unit(way: Array) -> Array:
-    out: Array = way / max(float(np.linalg.norm(way)), 1e-9)
+def _directions(steps: Array) -> Scalars:
+    """(3 k,) unit vectors of (k, 3) steps, one after the other."""
+    length = np.sqrt(np.add.reduce(steps * steps, axis=1, keepdims=True))
+    out: Scalars = (steps / np.maximum(length, 1e-9)).reshape(-1)
     return out

@@ -73,7 +73,10 @@ def hidden_samples(course: Course, x_mm: Array, blur_mm: float) -> Array:
     pairs = cKDTree(course.pixels).sparse_distance_matrix(
         cKDTree(course.pixels[some]), far, output_type="ndarray"
     )
-    i, j = pairs["i"], some[pairs["j"]]
+    # A shadow that ends before the line begins hides nothing.
+    to = (x_mm[:, -1] + blur_mm) * course.px_per_mm
+    near = np.flatnonzero(pairs["v"] <= to[pairs["i"]] + radius_px[some][pairs["j"]])
+    i, j = pairs["i"][near], some[pairs["j"][near]]
     apart = np.abs(course.arc_mm[i] - course.arc_mm[j])
     reach = NEAR_RADII * np.maximum(course.radius_mm[i], course.radius_mm[j]) + NEAR_MM
     other = (course.branch[i] != course.branch[j]) | (apart > reach)

@@ -78,7 +78,9 @@ def smooth_line(points_mm: Points, weight: Scalars, sigma_steps: float) -> Point
     pad = min(len(points_mm) - 1, int(3 * sigma_steps) + 1)
     odd = np.concatenate([-away[pad:0:-1], away, -away[-2 : -pad - 2 : -1]])
     wide = np.concatenate([w[pad:0:-1], w, w[-2 : -pad - 2 : -1]])
-    mean = ndimage.gaussian_filter1d(odd * wide, **blur) / ndimage.gaussian_filter1d(wide, **blur)
+    # Values and their weights in one call.
+    sums = ndimage.gaussian_filter1d(np.concatenate([odd * wide, wide], axis=1), **blur)
+    mean = sums[:, :-1] / sums[:, -1:]
     return chord + mean[pad : pad + len(points_mm)]
 
 
@@ -172,6 +174,7 @@ def _radii(lines: list[Points], centers: CenterPoints) -> tuple[list[Scalars], l
     told = np.bincount(nearest, known * given, minlength=len(points))
     told_mass = np.bincount(nearest, known, minlength=len(points))
     radii, trust = [], []
+    sigma = 1.5 / STEP_CELLS
     start = 0
     for line in lines:
         part = slice(start, start + len(line))
@@ -182,20 +185,20 @@ def _radii(lines: list[Points], centers: CenterPoints) -> tuple[list[Scalars], l
         use = np.ones(len(line))
         if len(line) > 4:
             use[[0, -1]] = 0.0
-        sigma = 1.5 / STEP_CELLS
-        area = _blur(volume[part] * use, sigma) / np.maximum(_blur(own * use, sigma), 1e-9)
-        radius = np.sqrt(np.maximum(area, 0) / np.pi)
-        share = _blur(told_mass[part], sigma)
-        spoken = _blur(told[part], sigma) / np.maximum(share, 1e-9)
-        radius = np.where(share > 1e-6, spoken, radius)
+        area, length, share, spoken, mass, cells = _blur(
+            np.stack(
+                [volume[part] * use, own * use, told_mass[part], told[part], volume[part],
+                 count[part]]
+            ), sigma,
+        )  # fmt: skip
+        radius = np.sqrt(np.maximum(area / np.maximum(length, 1e-9), 0) / np.pi)
+        radius = np.where(share > 1e-6, spoken / np.maximum(share, 1e-9), radius)
         radii.append(np.clip(radius, MIN_RADIUS_MM, MAX_RADIUS_MM))
-        trust.append(
-            _blur(volume[part], sigma)
-            / np.maximum(_blur(count[part], sigma) * centers.spacing_mm**3, 1e-9)
-        )
+        trust.append(mass / np.maximum(cells * centers.spacing_mm**3, 1e-9))
     return radii, [np.clip(t, 0.0, 1.0) for t in trust]
 
 
-def _blur(values: Array, sigma: float) -> Scalars:
-    out: Scalars = ndimage.gaussian_filter1d(values, sigma, mode="nearest", truncate=3.0)
+def _blur(values: Array, sigma: float) -> Array:
+    """(k, m) rows of values, blurred along a line of m points."""
+    out: Array = ndimage.gaussian_filter1d(values, sigma, mode="nearest", truncate=3.0)
     return out

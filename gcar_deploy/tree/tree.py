@@ -145,8 +145,11 @@ def empty_tree() -> Tree:
 
 def polyline_arc(points_mm: Points) -> Scalars:
     """(m,) distance of each point of a polyline from the first one along it, mm."""
-    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    steps = points_mm[1:] - points_mm[:-1]
+    arc = np.zeros(len(points_mm))
+    # Not np.linalg.norm and np.diff, whose calls take longer than the work.
+    np.cumsum(np.sqrt(np.add.reduce(steps * steps, axis=1)), out=arc[1:])
+    return arc
 
 
 def along(points_mm: Points, arc_mm: Scalars, at_mm: Array) -> Points:
@@ -162,7 +165,10 @@ def along(points_mm: Points, arc_mm: Scalars, at_mm: Array) -> Points:
     -------
     (..., 3)
     """
-    return np.stack([np.interp(at_mm, arc_mm, column) for column in points_mm.T], axis=-1)
+    out = np.empty((*at_mm.shape, 3))
+    for axis, column in enumerate(points_mm.T):
+        out[..., axis] = np.interp(at_mm, arc_mm, column)
+    return out
 
 
 def polyline_tangents(points_mm: Points) -> Points:
