@@ -54,15 +54,19 @@ def reference_lines(
     middle: Scalars = np.array([0.5 * own.arc_mm[-1] for own in sections])
     scatter = SCATTER[1]
     wholes = [_spans(own.arc_mm)[use] / ROUGH_MM for own, use in zip(sections, clear, strict=True)]
+    told = [
+        (own.arc_mm[use] - middle[k], own.diameter_mm[use], np.nan_to_num(own.sigma_mm[use]))
+        for k, (own, use) in enumerate(zip(sections, clear, strict=True))
+    ]
+    forks = _forks(tree)
     for number in range(_FIRST + _ROUNDS):
-        H, pull = _wishes(tree, level, slope, middle)
+        H, pull = _wishes(forks, level, slope, middle)
         left = []
-        for k, (own, use) in enumerate(zip(sections, clear, strict=True)):
-            off, diameter = own.arc_mm[use] - middle[k], own.diameter_mm[use]
+        for k, (off, diameter, sigma) in enumerate(told):
             line = np.maximum(level[k] + slope[k] * off, _LEAST_MM)
             z = diameter / line - 1
             left.append(z)
-            variance = scatter**2 + (np.nan_to_num(own.sigma_mm[use]) / line) ** 2
+            variance = scatter**2 + (sigma / line) ** 2
             if number < _FIRST:
                 weight = np.where(z > 0, EXPECTILE, 1 - EXPECTILE)
             else:
@@ -103,7 +107,23 @@ def _scatter(left: Scalars) -> float:
     return float(np.clip(size, *SCATTER))
 
 
-def _wishes(tree: Tree, level: Scalars, slope: Scalars, middle: Scalars) -> tuple[Array, Scalars]:
+def _forks(tree: Tree) -> list[tuple[int, list[int]]]:
+    """Branch and those that begin where it ends, for each place where one becomes several."""
+    into: dict[int, list[int]] = {}
+    out: dict[int, list[int]] = {}
+    for k, branch in enumerate(tree.branches):
+        into.setdefault(branch.end, []).append(k)
+        out.setdefault(branch.start, []).append(k)
+    return [
+        (into[node][0], out[node])
+        for node in range(len(tree.nodes_mm))
+        if len(into.get(node, ())) == 1 and len(out.get(node, ())) > 1
+    ]
+
+
+def _wishes(
+    forks: Sequence[tuple[int, list[int]]], level: Scalars, slope: Scalars, middle: Scalars
+) -> tuple[Array, Scalars]:
     """Return what is known without a section: normal matrix and right side over the lines.
 
     The usual taper, a level near the branch's own, and the flow law at every bifurcation, linear
@@ -111,21 +131,16 @@ def _wishes(tree: Tree, level: Scalars, slope: Scalars, middle: Scalars) -> tupl
     """
     count, q = len(level), FLOW_EXPONENT
     each = np.arange(count)
-    rows = np.zeros((2 * count + len(tree.nodes_mm), 2 * count))
+    rows = np.zeros((2 * count + len(forks), 2 * count))
     rows[each, count + each], rows[each, each] = 1 / (TAPER_SD * level), -TAPER / (TAPER_SD * level)
     rows[count + each, each] = 1 / (LEVEL_SD * level)
     wanted = np.zeros(len(rows))
     wanted[count + each] = 1 / LEVEL_SD
-    for node in range(len(tree.nodes_mm)):
-        parents = [k for k, branch in enumerate(tree.branches) if branch.end == node]
-        children = [k for k, branch in enumerate(tree.branches) if branch.start == node]
-        if len(parents) != 1 or len(children) < 2:
-            continue
+    for row, (parent, children) in zip(rows[2 * count :], forks, strict=True):
         begin = np.maximum(level[children] - slope[children] * middle[children], _LEAST_MM)
         total = float((begin**q).sum() ** (1 / q))
         by_child = (begin / total) ** (q - 1)
-        row = rows[2 * count + node]
-        row[parents[0]], row[count + parents[0]] = 1.0, middle[parents[0]]
+        row[parent], row[count + parent] = 1.0, middle[parent]
         row[children] = -by_child
         row[count + np.array(children)] = by_child * middle[children]
         row /= LAW_SD * total

@@ -23,8 +23,6 @@ from gcar_deploy.output.volume import nifti_bytes
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 
-#: threads beside the one that makes the tables
-_WORKERS = 2
 RESULT_NAME = "result.json"
 #: lattice of the lumen surface: finer than a section every 0.8 mm, and still a few megabytes
 SURFACE_EDGE_MM = 0.4
@@ -47,11 +45,12 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         An extra is unknown, or needs a library that is not installed.
     """
     check_extras(extras)
-    with ThreadPoolExecutor(_WORKERS, "gcar-render") as pool:
-        # What works long outside Python goes beside the tables.
-        meshed = pool.submit(lumen_surface, result.tree, SURFACE_EDGE_MM)
-        drawn = [pool.submit(_drawn, result, k) for k in range(len(result.views))]
+    with ThreadPoolExecutor(1, "gcar-render") as pool:
+        # Only what works long outside Python goes beside the rest: threads that both need Python
+        # wait for each other longer than they gain. Marching cubes does not let go of it.
         occupancy = pool.submit(nifti_bytes, result.volume, result.grid)
+        drawn = [pool.submit(_drawn, result, k) for k in range(len(result.views))]
+        surface = lumen_surface(result.tree, SURFACE_EDGE_MM)
         ghosts = result.ghost_probability
         tables = {
             "gaussians.npz": gaussians_npz(result.gaussians),
@@ -62,7 +61,6 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
         }
         summary = result.summary()
         pictures = [one.result() for one in drawn]
-        surface = meshed.result()
         files = {"volume.nii.gz": occupancy.result(), **tables, "surface.stl": stl_bytes(surface)}
     if "glb" in extras:
         from gcar_deploy.output.glb import glb_bytes

@@ -112,19 +112,24 @@ def _near_columns(
     ry = lower[1] + (y + 0.5) * spacing[1] - a[own, 1]
     along = rx * axis[own, 0] + ry * axis[own, 1]
     flat = (x * grid.shape[1] + y) * grid.shape[2]
+    # What is one along a column, beside its height: repeating rows is faster than looking up.
+    table = [along, axis[own, 2], a[own, 2], length2[own], rx, axis[own, 0], ry, axis[own, 1],
+             ra[own], (rb - ra)[own]]  # fmt: skip
+    along, az, rz, square, dx, ax, dy, ay, radius, taper = np.repeat(
+        np.array(table), height, axis=1
+    )
     column = np.repeat(np.arange(len(x)), height)
     z = np.arange(len(column)) - np.repeat(np.cumsum(height) - height - first, height)
-    capsule = own[column]
-    ax, ay, az = np.ascontiguousarray(axis.T)
-    az = az[capsule]
-    rz = lower[2] + (z + 0.5) * spacing[2] - a[:, 2][capsule]
-    t = (along[column] + rz * az) / length2[capsule]
+    rz = lower[2] + (z + 0.5) * spacing[2] - rz
+    t = (along + rz * az) / square
     t = np.minimum(np.maximum(t, 0.0), 1.0)
-    dx, dy = rx[column] - t * ax[capsule], ry[column] - t * ay[capsule]
+    dx -= t * ax
+    dy -= t * ay
     rz -= t * az
-    distance = np.sqrt(dx * dx + dy * dy + rz * rz) - (ra[capsule] + t * (rb - ra)[capsule])
+    distance = np.sqrt(dx * dx + dy * dy + rz * rz) - (radius + t * taper)
     near = np.flatnonzero(distance < far_mm)
-    return flat[column[near]] + z[near], capsule[near], distance[near]
+    column = column[near]
+    return flat[column] + z[near], own[column], distance[near]
 
 
 def _supersampled(

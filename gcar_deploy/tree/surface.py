@@ -29,6 +29,15 @@ COARSEST_MM = 0.8
 BLOCK = 24
 #: distances are exact to so far outside, lattice edges
 FAR = 2.0
+#: the block with the first of its neighbours' points: neighbour, where to, and of what of it
+_PARTS = tuple(
+    (
+        np.array(beyond),
+        tuple(slice(BLOCK, None) if d else slice(BLOCK) for d in beyond),
+        tuple(slice(1) if d else slice(None) for d in beyond),
+    )
+    for beyond in itertools.product((0, 1), repeat=3)
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,25 +87,27 @@ def _blocks(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
     """
     number = np.full(-(-np.array(lattice.shape) // BLOCK) + 1, -1)
     cell, value = _near(tree, lattice)
-    at = np.unravel_index(cell, lattice.shape)
-    block = tuple(x // BLOCK for x in at)
-    number[block] = 0
+    # Block of each place and where in it, by tables along each axis: nothing is divided twice.
+    steps = np.array([number.shape[1] * number.shape[2], number.shape[2], 1])
+    block, place = np.zeros((2, len(cell)), np.int64)
+    for axis, x in enumerate(np.unravel_index(cell, lattice.shape)):
+        number_of, within = np.divmod(np.arange(lattice.shape[axis]), BLOCK)
+        block += (number_of * steps[axis])[x]
+        place += (within * BLOCK ** (2 - axis))[x]
+    flat = number.reshape(-1)
+    flat[block] = 0
     occupied = np.argwhere(number == 0)
     number[tuple(occupied.T)] = np.arange(len(occupied))
     edge = float(lattice.spacing_mm[0])
     # One more, which number -1 finds: no vessel.
     tiles = np.full((len(occupied) + 1, BLOCK, BLOCK, BLOCK), FAR * edge, np.float32)
-    place = number[block]
-    for x, first in zip(at, block, strict=True):
-        place = place * BLOCK + (x - first * BLOCK)
+    place += flat[block] * BLOCK**3
     np.minimum.at(tiles.reshape(-1), place, value)
     # A vertex exactly on a lattice point would collapse triangles; nothing may be exactly 0.
     tiles[np.abs(tiles) < 1e-3 * edge] = 1e-3 * edge
     for corner in occupied:
         distance = np.empty((BLOCK + 1,) * 3, np.float32)
-        for beyond in itertools.product((0, 1), repeat=3):
-            to = tuple(slice(BLOCK, None) if d else slice(BLOCK) for d in beyond)
-            of = tuple(slice(1) if d else slice(None) for d in beyond)
+        for beyond, to, of in _PARTS:
             distance[to] = tiles[number[tuple(corner + beyond)]][of]
         if distance.min() < 0 < distance.max():
             yield BLOCK * corner, distance
