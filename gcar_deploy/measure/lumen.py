@@ -12,7 +12,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.measure.borders import between_borders
 from gcar_deploy.measure.reference import reference_lines
 from gcar_deploy.measure.sections import Sections, sections_of_radii
-from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
 #: a stretch this much narrower than its reference (share) counts as lesion.
@@ -194,19 +194,28 @@ def hidden_share(tree: Tree, carm: CArm) -> float | None:
     total = tree.length_mm
     if not total > 0:
         return None
-    return sum(foreshortening(b, carm) * b.length_mm for b in tree.branches) / total
+    lengths = np.array([branch.length_mm for branch in tree.branches])
+    return float(foreshortening(tree, carm) @ lengths) / total
 
 
-def foreshortening(branch: Branch, carm: CArm) -> float:
-    """Share of the branch's length that a view hides, 0 (in the picture plane) .. 1 (end on)."""
-    steps = np.diff(branch.points_mm, axis=0)
-    length = np.linalg.norm(steps, axis=1)
-    middle = 0.5 * (branch.points_mm[1:] + branch.points_mm[:-1])
-    ray = middle - carm.source_mm
+def foreshortening(tree: Tree, carm: CArm) -> Scalars:
+    """(branches,) share of each one's length that a view hides.
+
+    From 0 (in the picture plane) to 1 (end on).
+    """
+    starts, ends, *_ = tree.segments()
+    steps = ends - starts
+    ray = 0.5 * (ends + starts) - carm.source_mm
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
     across = np.linalg.norm(np.cross(steps, ray), axis=1)
-    total = float(length.sum())
-    return float(1.0 - across.sum() / total) if total > 0 else 0.0
+    count = len(tree.branches)
+    branch = np.repeat(np.arange(count), np.array([len(b) - 1 for b in tree.branches], np.int64))
+    seen, length = (
+        np.bincount(branch, values, minlength=count)
+        for values in (across, np.linalg.norm(steps, axis=1))
+    )
+    out: Scalars = np.where(length > 0, 1.0 - seen / np.where(length > 0, length, 1.0), 0.0)
+    return out
 
 
 def _direction(points_mm: Scalars, radius_mm: Scalars) -> Scalars:

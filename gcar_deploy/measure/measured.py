@@ -78,9 +78,7 @@ def measured(
         bifurcations=bifurcations(tree, lumens),
         unplaced=unplaced,
         angles=bifurcation_angles(tree),
-        hidden=np.array(
-            [[foreshortening(branch, view.carm) for view in views] for branch in tree.branches]
-        ).reshape(-1, len(views)),
+        hidden=np.stack([foreshortening(tree, carm) for carm in carms], axis=1),
         residual_mm=np.stack([residuals(points, view) for view in views]),
         further=best_further_view(tree, carms),
     )

@@ -19,7 +19,7 @@ from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.predict import bilinear
-from gcar_deploy.tree.tree import Branch, Tree
+from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
 #: a profile is followed so many radii, and at least so many pixels, to each side
@@ -105,7 +105,8 @@ def scale_factor(tree: Tree, view: VesselImage) -> float | None:
     float, 1 where both agree; None where too few vessels stand alone in the picture, or where it
     looks below 1 and all are of one calibre: blur would look the same
     """
-    lines = [_profiles(branch, view) for branch in tree.branches if len(branch) > 2]
+    long = tuple(branch for branch in tree.branches if len(branch) > 2)
+    lines = _profiles(dataclasses.replace(tree, branches=long), view)
     if not lines:
         return None
     # One look at the picture for all profiles.
@@ -147,22 +148,35 @@ class _Profiles:
     sine: Scalars
 
 
-def _profiles(branch: Branch, view: VesselImage) -> _Profiles:
-    """Profiles across those points of a branch that do not run along the ray."""
-    pixels, depth = view.carm.project(branch.points_mm)
+def _profiles(tree: Tree, view: VesselImage) -> list[_Profiles]:
+    """Profiles across those points of each branch that do not run along the ray."""
+    points = tree.points()
+    pixels, depth = view.carm.project(points)
     size_mm = _pixel_mm(view.carm) * depth / view.carm.sdd_mm
-    along = np.gradient(pixels, axis=0)
+    branch = tree.branch_index()
+    index = np.arange(len(points))
+    # Between neighbours, of a branch's ends from the point itself.
+    before = index - (np.diff(branch, prepend=-1) == 0)
+    after = index + (np.diff(branch, append=-1) == 0)
+    along = (pixels[after] - pixels[before]) / (after - before)[:, None]
     length = np.linalg.norm(along, axis=1)
     good = (depth > 1.0) & (length > 1e-6)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(length, 1e-6)[:, None]
-    ray = branch.points_mm - view.carm.source_mm
+    ray = points - view.carm.source_mm
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    sine = np.linalg.norm(np.cross(ray, branch.tangents), axis=1)
+    tangents = np.concatenate([np.zeros((0, 3)), *(b.tangents for b in tree.branches)])
+    sine = np.linalg.norm(np.cross(ray, tangents), axis=1)
     good &= sine > _LEAST_SINE
-    reach = max(_REACH_PX, _REACH_RADII * float(np.max(branch.radius_mm / size_mm)))
-    x = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
-    at = pixels[good, None] + x[None, :, None] * normal[good, None]
-    return _Profiles(at, x, size_mm[good], sine[good])
+    radius_px = tree.radii() / size_mm
+    found = []
+    for k in range(len(tree.branches)):
+        own = branch == k
+        reach = max(_REACH_PX, _REACH_RADII * float(np.max(radius_px[own])))
+        x = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
+        own &= good
+        at = pixels[own, None] + x[None, :, None] * normal[own, None]
+        found.append(_Profiles(at, x, size_mm[own], sine[own]))
+    return found
 
 
 def _sections(line: _Profiles, path_mm: Array) -> Array:

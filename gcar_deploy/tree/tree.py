@@ -58,10 +58,12 @@ class Branch:
             return np.full((len(self), 2), np.nan)
         return worst_sigma(self.covariance_mm2)
 
-    @property
+    @functools.cached_property
     def tangents(self) -> Points:
-        """(m, 3) unit vectors along the centreline."""
-        return polyline_tangents(self.points_mm)
+        """(m, 3) unit vectors along the centreline; read only."""
+        tangents = polyline_tangents(self.points_mm)
+        tangents.setflags(write=False)
+        return tangents
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from gcar_deploy.measure.lumen import (
     foreshortening,
     tree_lumens,
 )
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.tree.shapes import branch, fork, tube
 
 
@@ -63,7 +65,9 @@ def test_foreshortening_is_one_along_the_beam_and_none_across_it():
         primary_angle_deg=0, secondary_angle_deg=0, sod_mm=5000, sdd_mm=7000, rows=64, columns=64,
         pixel_spacing_mm=(1.0, 1.0),
     )  # fmt: skip
-    along = tube(axis=carm.axes[2]).branches[0]
-    across = tube(axis=carm.axes[0]).branches[0]
-    assert foreshortening(along, carm) > 0.99
-    assert foreshortening(across, carm) < 1e-4
+    along, across = tube(axis=carm.axes[2]), tube(axis=carm.axes[0])
+    both = dataclasses.replace(along, branches=(*along.branches, *across.branches))
+    first, second = foreshortening(both, carm)
+    assert first > 0.99
+    assert second < 1e-4
+    assert len(foreshortening(empty_tree(), carm)) == 0
