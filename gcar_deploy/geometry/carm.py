@@ -152,8 +152,7 @@ class CArm:
         P = _normalised(P)
         object.__setattr__(self, "projection_matrix", tuple(map(tuple, P.tolist())))
         probe = 30.0 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        own = _apply(self._matrix_from_angles(), probe)[0]
-        given = _apply(P, probe)[0]
+        own, given = _apply(self._matrix_from_angles(), probe)[0], _apply(P, probe)[0]
         gap = float(np.abs(own - given).max())
         if gap > MATRIX_TOLERANCE_PX:
             raise GeometryError(
@@ -413,7 +412,9 @@ def _normalised(P: Array) -> Array:
 
 
 def _apply(P: Array, points: Points) -> tuple[Pixels, Scalars]:
-    homogeneous = points @ P[:, :3].T + P[:, 3]
-    depth = homogeneous[:, 2]
+    # Coordinates as rows: several times faster than three columns, and equal to the last bit.
+    homogeneous = P[:, :3] @ points.T + P[:, 3:]
+    pixels = np.empty((len(points), 2))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return homogeneous[:, :2] / depth[:, None], depth
+        np.divide(homogeneous[:2], homogeneous[2], out=pixels.T)
+    return pixels, homogeneous[2]

@@ -151,8 +151,7 @@ def slices_along(plane_axes: Array, carm: CArm, pixels: Pixels) -> tuple[Scalars
     # A pixel's ray is M^-1 (col, row, 1), of unit depth; its share along three axes.
     M = carm.world2pixel[:, :3]
     axes = np.linalg.solve(M.T, plane_axes)
-    rays = np.asarray(pixels, dtype=np.float64) @ axes[:2] + axes[2]
-    across, ahead, along = rays.T
+    across, ahead, along = axes[:2].T @ np.asarray(pixels, dtype=np.float64).T + axes[2][:, None]
     from_base = across * across + ahead * ahead
     # d Omega is the pixel's area at unit depth (1 / |det M|) over the ray's length cubed, and
     # sin(theta) is its distance from the line over its length.

