@@ -159,15 +159,15 @@ def along(points_mm: Points, arc_mm: Scalars, at_mm: Array) -> Points:
 
     Parameters
     ----------
-    points_mm : (m, 3)
+    points_mm : (m, d), also of a picture
     arc_mm : (m,) ascending distance of each
     at_mm : (...) distances asked for; those beyond the ends are held to them
 
     Returns
     -------
-    (..., 3)
+    (..., d)
     """
-    out = np.empty((*at_mm.shape, 3))
+    out = np.empty((*at_mm.shape, points_mm.shape[1]))
     for axis, column in enumerate(points_mm.T):
         out[..., axis] = np.interp(at_mm, arc_mm, column)
     return out
