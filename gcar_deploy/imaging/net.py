@@ -29,8 +29,10 @@ from gcar_deploy.types import Array, Image, Mask
 
 #: sides of the network's input are multiples of this
 STRIDE = 16
-#: a picture is brought to the area of a square with this side, pixels; its longer side has a limit
-SIDE = 352
+#: a picture is brought to the area of a square with this side, pixels, or, if it is finer, of one
+#: with the second: thin vessels would be lost, and a picture blown up shows no more than it did
+SIDE, FINEST_SIDE = 352, 448
+#: of the longer side
 _LONGEST = 1024
 #: what the spec of a fitting model says of its input
 INPUT = {"channels": 3, "stride": STRIDE, "side": SIDE}
@@ -46,10 +48,16 @@ NOMINAL_MM = 0.5
 _LEAST_UNIT = 0.05
 
 
+def network_scale(rows: int, columns: int) -> float:
+    """Pixels of the network for one of a picture of this size."""
+    side = float(np.sqrt(rows * columns))
+    return min(float(np.clip(side, SIDE, FINEST_SIDE)) / side, _LONGEST / max(rows, columns))
+
+
 def at_network_size(picture: Image, holes: Mask) -> tuple[Image, Mask]:
     """Return picture and holes at the size that the network looks at."""
     rows, columns = picture.shape
-    scale = min(SIDE / float(np.sqrt(rows * columns)), _LONGEST / max(rows, columns))
+    scale = network_scale(rows, columns)
     size = (max(STRIDE, round(columns * scale)), max(STRIDE, round(rows * scale)))
     work = resize(enhance.fill_holes(picture, holes), size)
     return work, resize(holes.astype(np.float32), size) > 0.1
