@@ -393,7 +393,7 @@ def train_segmenter(
 @main.command("export-segmenter")
 @click.argument("checkpoint", type=_FILE)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-@click.option("--devices", type=_FILE, help="Checkpoint of train-devices, to go into it.")
+@click.option("--devices", type=_FILE, help="Of train-devices, or a model that has one: goes in.")
 def export_segmenter(checkpoint: Path, out: Path, devices: Path | None) -> None:
     """Turn the segmentation network's CHECKPOINT into one ONNX file with its spec, and prove it.
 

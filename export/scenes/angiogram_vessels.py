@@ -11,7 +11,7 @@ from scipy import ndimage
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.types import Array, Image, Mask
 from gcar_export.scenes.render import path_lengths
-from gcar_export.scenes.trees import SyntheticTree, random_tree, rough_style, thin_style
+from gcar_export.scenes.trees import SyntheticTree, random_tree
 
 #: a catheter's outer diameter (4 to 9 F), mm; what it absorbs as a share of a vessel as wide; and
 #: how many show their walls more than their lumen
@@ -20,8 +20,6 @@ CATHETER_SHARE = (0.35, 1.0)
 HOLLOW = 0.2
 #: twigs wider than this are drawn by experts, thinner ones by some, pixels
 DRAWN_PX = 2.5
-#: trees with many thin branches, and with rough walls; the others are like those of CT labels
-THIN_SHARE, ROUGH_SHARE = 0.4, 0.2
 #: long even branches at most, which look like wires and are none
 LONG_BRANCHES = 3
 
@@ -46,10 +44,7 @@ class Vessels:
 
 def random_vessels(rng: np.random.Generator, side: int, pixel_mm: float) -> Vessels:
     """Draw one tree from a random direction, at times only a part of it, and wriggle it."""
-    kind = rng.random()
-    rough = rough_style(rng) if kind < THIN_SHARE + ROUGH_SHARE else None
-    style = thin_style(rng) if kind < THIN_SHARE else rough
-    tree = random_tree(rng, style).sides("left" if rng.random() < 0.65 else "right")
+    tree = random_tree(rng).sides("left" if rng.random() < 0.65 else "right")
     carm = _view(rng, tree, side, pixel_mm)
     path = _filled(rng, tree, carm) / np.float32(pixel_mm)
     start = carm.project(tree.vessels[0].points_mm[:6])[0]

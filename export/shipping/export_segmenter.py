@@ -25,7 +25,7 @@ from gcar_export.shipping.parity import PARITY
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.segmenter_start import begin_with
+from gcar_export.training.segmenter_start import begin_with, model_weights
 
 #: seed of the pictures that parity is checked on
 PARITY_SEED = 70_002
@@ -91,7 +91,12 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
 
 
 def load_device_checkpoint(path: Path) -> DeviceUNet:
-    """Read the ``checkpoint.safetensors`` of ``training.devices`` beside its ``manifest.json``."""
+    """Read the checkpoint of ``training.devices`` beside its manifest, or an ONNX model."""
+    if path.suffix == ".onnx":
+        net = DeviceUNet(DeviceUNetConfig())
+        read = model_weights(path, "devices.")
+        filled(net, {f"net.{name}": value for name, value in read.items()}, path.name)
+        return net.eval()
     config = dict(read_manifest(path)["config"])
     config["width"] = tuple(config["width"])
     net = DeviceUNet(DeviceUNetConfig(**config))
@@ -126,7 +131,8 @@ def export_segmenter(
     checkpoint : of the segmenter, or an ONNX model whose segmenter is taken as it is
     out : the file
     pictures : generated ones that torch and ONNX Runtime are compared on
-    devices : checkpoint of the device network, or None: the segmenter's own answer stays
+    devices : checkpoint of the device network, or an ONNX model that holds one; None: the
+        segmenter's own answer stays
 
     Returns
     -------
@@ -181,7 +187,10 @@ def _training(checkpoint: Path, devices: Path | None) -> dict[str, Any]:
         training = dict(json.loads(checkpoint.with_suffix(".json").read_text())["training"])
     else:
         training = json.loads((checkpoint.parent / "manifest.json").read_text())
-    if devices is not None:
+    if devices is not None and devices.suffix == ".onnx":
+        told = json.loads(devices.with_suffix(".json").read_text())
+        training["devices"] = told["training"]["devices"]
+    elif devices is not None:
         training["devices"] = read_manifest(devices)
     return training
 

@@ -35,7 +35,7 @@ def begin_with(net: MaskUNet, path: Path) -> str:
     ModelError
         A weight is missing or has another shape.
     """
-    found = _of_onnx(path) if path.suffix == ".onnx" else weights(load_file(path))
+    found = model_weights(path, _PREFIX) if path.suffix == ".onnx" else weights(load_file(path))
     own = net.state_dict()
     for name, value in own.items():
         given = found.get(name)
@@ -74,22 +74,26 @@ def frozen_segmenter(path: Path) -> Segmenter:
     return Segmenter(cast(Session, _Own(net.eval())))
 
 
-def _of_onnx(path: Path) -> dict[str, torch.Tensor]:
-    """Convolutions keep their names; what scales and shifts after each follows in its order."""
+def model_weights(path: Path, prefix: str) -> dict[str, torch.Tensor]:
+    """Read one network's weights out of an ONNX model: those whose names begin with ``prefix``.
+
+    Convolutions keep their names; what scales and shifts after each follows in its order.
+    """
     import onnx
     from onnx import numpy_helper
 
     graph = onnx.load(str(path)).graph
     arrays = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
-    found = {k.removeprefix(_PREFIX): v for k, v in arrays.items() if k.startswith(_PREFIX)}
+    found = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
     layer = ""
     for node in graph.node:
         held = [name for name in node.input if name in arrays]
-        if node.op_type == "Conv" and f"{_PREFIX}head.weight" in held:
-            break
         if node.op_type == "Conv":
-            block, number = held[0].removesuffix(".weight").removeprefix(_PREFIX).rsplit(".", 1)
-            layer = f"{block}.{int(number) + 1}"
+            layer = ""
+            # A head is scaled by nothing; ``layer`` is the norm behind the convolution.
+            if held[0].startswith(prefix) and "." in held[0].removeprefix(prefix)[:-7]:
+                block, number = held[0].removesuffix(".weight").removeprefix(prefix).rsplit(".", 1)
+                layer = f"{block}.{int(number) + 1}"
         for name in held:
             if layer and node.op_type in ("Mul", "Add") and arrays[name].ndim == 4:
                 part = "weight" if node.op_type == "Mul" else "bias"

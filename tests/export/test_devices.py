@@ -169,6 +169,12 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     np.testing.assert_array_equal(first.device, second.device)
     np.testing.assert_allclose(first.probability, before.probability, atol=1e-4)
     assert (before.device != after.device).any()
+    # Both networks of a model go into another one.
+    again = tmp_path / "again.onnx"
+    export_segmenter(out, again, 1, out)
+    same = open_segmenter(again, threads=1).look(channels)
+    np.testing.assert_allclose(same.device, after.device, atol=1e-5)
+    assert json.loads(again.with_suffix(".json").read_text())["training"] == spec["training"]
 
 
 def test_size_of_the_network():
