@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -111,9 +111,12 @@ class _CheckpointSession:
         told = None if devices is None else load_device_checkpoint(devices)
         self.net = _Deployed(load_segmenter_checkpoint(checkpoint), told).eval()
 
-    def run(self, inputs: Mapping[str, Array], *_: object, **__: object) -> list[Array]:
+    def run(
+        self, inputs: Mapping[str, Array], *_: object, outputs: Sequence[str], **__: object
+    ) -> list[Array]:
         with torch.no_grad():
-            return [m.numpy() for m in self.net(torch.from_numpy(inputs["channels"]))]
+            told = self.net(torch.from_numpy(inputs["channels"]))
+        return [told[OUTPUTS.index(name)].numpy() for name in outputs]
 
 
 def checkpoint_segmenter(checkpoint: Path, devices: Path | None = None) -> Segmenter:

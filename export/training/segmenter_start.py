@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import Segmenter
+from gcar_deploy.imaging.net import OUTPUTS, Segmenter
 from gcar_deploy.models import Session
 from gcar_deploy.types import Array
 from gcar_export.training.networks.mask_unet import MaskUNet
@@ -55,10 +55,15 @@ class _Own:
     def __init__(self, net: MaskUNet) -> None:
         self.net = net
 
-    def run(self, inputs: Mapping[str, Array], *_: object, **__: object) -> list[Array]:
+    def run(
+        self, inputs: Mapping[str, Array], *_: object, outputs: Sequence[str], **__: object
+    ) -> list[Array]:
         with torch.no_grad():
             vessel, chord, device = self.net(torch.from_numpy(inputs["channels"])).split(1, dim=1)
-        return [m.numpy() for m in (torch.sigmoid(vessel), chord, torch.sigmoid(device))]
+        told = dict(
+            zip(OUTPUTS, (torch.sigmoid(vessel), chord, torch.sigmoid(device)), strict=True)
+        )
+        return [told[name].numpy() for name in outputs]
 
 
 def frozen_segmenter(path: Path) -> Segmenter:

@@ -19,7 +19,15 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
 from gcar_deploy.imaging.device_lines import device_parts
-from gcar_deploy.imaging.net import NOMINAL_MM, Seen, Segmenter, at_network_size, net_input
+from gcar_deploy.imaging.net import (
+    FINEST_SIDE,
+    NOMINAL_MM,
+    SIDE,
+    Seen,
+    Segmenter,
+    at_network_size,
+    net_input,
+)
 from gcar_deploy.types import Image, Mask
 
 #: hysteresis on the network's probability: what is faint counts where it touches what is sure
@@ -67,7 +75,7 @@ def learned_vessels(
     """
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
-    seen = segmenter.look(net_input(work, work_holes))
+    seen = _seen(segmenter, search, holes)
     device = devices(seen, work, work_holes)
     other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
@@ -93,6 +101,18 @@ def learned_vessels(
     return found, path
 
 
+def _seen(segmenter: Segmenter, picture: Image, holes: Mask) -> Seen:
+    """Look for vessels as finely as the network may, for devices at the size that it learned."""
+    fine, coarse = (
+        net_input(*at_network_size(picture, holes, side)) for side in (FINEST_SIDE, SIDE)
+    )
+    if fine.shape == coarse.shape:
+        return segmenter.look(fine)
+    vessel, chord = segmenter.answers(fine, ("probability", "chord"))
+    (device,) = segmenter.answers(coarse, ("device",))
+    return Seen(vessel, chord, segment.resize(device, vessel.shape[::-1]))
+
+
 def devices(seen: Seen, picture: Image, holes: Mask) -> Mask:
     """(rows, cols) bool: lines that are catheters, leads or wires.
 
@@ -105,11 +125,13 @@ def devices(seen: Seen, picture: Image, holes: Mask) -> Mask:
     if not line.any():
         return np.zeros_like(reach)
     filled = enhance.fill_holes(picture, holes)
-    flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / NOMINAL_MM)
-    sigma_px = enhance.ridges(flat, NOMINAL_MM).sigma_px
-    found = skel.beside_alone(reach, line, catheters(line, flat, sigma_px, ~holes, NOMINAL_MM))
+    finer = float(np.sqrt(picture.size)) / SIDE
+    pixel_mm = NOMINAL_MM / finer
+    flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / pixel_mm)
+    sigma_px = enhance.ridges(flat, pixel_mm).sigma_px
+    found = skel.beside_alone(reach, line, catheters(line, flat, sigma_px, ~holes, pixel_mm))
     reach, either = _line(np.where(holes, np.float32(0), np.maximum(vessel, seen.device)))
-    for part in device_parts(either, seen.device, ~holes, ALONE_LEVEL):
+    for part in device_parts(either, seen.device, ~holes, ALONE_LEVEL, finer):
         more = found | skel.beside_alone(reach, either, part)
         # A small tree behind a long catheter may be taken for one with it.
         if (more & line).sum() <= ALONE_SHARE * line.sum():

@@ -13,7 +13,7 @@ it is given the picture and the answers of the first.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -48,16 +48,16 @@ NOMINAL_MM = 0.5
 _LEAST_UNIT = 0.05
 
 
-def network_scale(rows: int, columns: int) -> float:
+def network_scale(rows: int, columns: int, finest: int = FINEST_SIDE) -> float:
     """Pixels of the network for one of a picture of this size."""
     side = float(np.sqrt(rows * columns))
-    return min(float(np.clip(side, SIDE, FINEST_SIDE)) / side, _LONGEST / max(rows, columns))
+    return min(float(np.clip(side, SIDE, finest)) / side, _LONGEST / max(rows, columns))
 
 
-def at_network_size(picture: Image, holes: Mask) -> tuple[Image, Mask]:
+def at_network_size(picture: Image, holes: Mask, finest: int = FINEST_SIDE) -> tuple[Image, Mask]:
     """Return picture and holes at the size that the network looks at."""
     rows, columns = picture.shape
-    scale = network_scale(rows, columns)
+    scale = network_scale(rows, columns, finest)
     size = (max(STRIDE, round(columns * scale)), max(STRIDE, round(rows * scale)))
     work = resize(enhance.fill_holes(picture, holes), size)
     return work, resize(holes.astype(np.float32), size) > 0.1
@@ -130,11 +130,16 @@ class Segmenter:
         return dataclasses.replace(self, should_stop=should_stop)
 
     def look(self, channels: Array) -> Seen:
-        """Return what the network sees in a picture.
+        """Return what the network sees in a picture; see ``answers``."""
+        return Seen(*self.answers(channels))
+
+    def answers(self, channels: Array, wanted: Sequence[str] = OUTPUTS) -> list[Image]:
+        """Return some of ``OUTPUTS``, each (rows, cols) float32.
 
         Parameters
         ----------
         channels : (3, rows, cols) float32, from ``net_input``
+        wanted : their names; what is not asked for is not worked out
 
         Raises
         ------
@@ -148,10 +153,10 @@ class Segmenter:
         )
         shape = (1, 1, rows + down, cols + right)
         maps = self.session.run(
-            {"channels": padded[None]}, [shape] * len(OUTPUTS),
-            outputs=OUTPUTS, should_stop=self.should_stop,
+            {"channels": padded[None]}, [shape] * len(wanted),
+            outputs=wanted, should_stop=self.should_stop,
         )  # fmt: skip
-        return Seen(*(np.ascontiguousarray(m[0, 0, :rows, :cols], np.float32) for m in maps))
+        return [np.ascontiguousarray(m[0, 0, :rows, :cols], np.float32) for m in maps]
 
 
 def open_segmenter(path: Path, *, threads: int = 2) -> Segmenter:

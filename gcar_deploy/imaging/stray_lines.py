@@ -19,7 +19,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.device_lines import device_parts
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
-from gcar_deploy.imaging.net import network_scale
+from gcar_deploy.imaging.net import SIDE, network_scale
 from gcar_deploy.types import Mask
 
 #: so near to the border of the field a line comes from outside, mm
@@ -65,7 +65,8 @@ def likely_devices(view: VesselImage, level: float) -> Iterator[Mask]:
     """Yield (rows, cols) bool parts of the view's skeleton that are so probably a device."""
     if view.device is None:
         return
-    finer = 1 / network_scale(*view.mask.shape)
+    rows, columns = view.mask.shape
+    finer = 1 / network_scale(rows, columns, SIDE)
     yield from device_parts(view.skeleton, view.device, None, level, finer)
 
 

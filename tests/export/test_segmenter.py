@@ -12,11 +12,14 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 from gcar_deploy.config import ImagingOptions  # noqa: E402
 from gcar_deploy.errors import ImageError, ModelError, UsageError  # noqa: E402
 from gcar_deploy.imaging.extract import extract_vessels  # noqa: E402
-from gcar_deploy.imaging.learned import support  # noqa: E402
+from gcar_deploy.imaging.learned import learned_vessels, support  # noqa: E402
 from gcar_deploy.imaging.net import (  # noqa: E402
     KIND,
+    OUTPUTS,
     Seen,
+    Segmenter,
     at_network_size,
+    load_segmenter,
     net_input,
     open_segmenter,
 )
@@ -227,6 +230,25 @@ def test_the_networks_size_is_that_of_the_picture_not_of_its_pixels():
         assert work.shape[0] / work.shape[1] == pytest.approx(shape[0] / shape[1], rel=0.02)
     long = np.zeros((64, 4096), np.float32)
     assert at_network_size(long, long > 0)[0].shape == (16, 1024)
+
+
+def test_devices_are_looked_for_at_the_size_they_were_learned_at():
+    asked = []
+
+    class Watched(Segmenter):
+        def answers(self, channels, wanted=OUTPUTS):
+            asked.append((channels.shape[1:], tuple(wanted)))
+            return super().answers(channels, wanted)
+
+    rng = np.random.default_rng(4)
+    for side in (300, 512):
+        picture = cv2.GaussianBlur(rng.random((side, side), np.float32), (0, 0), 3)
+        net = Watched(load_segmenter("net", 1).session)
+        learned_vessels({"display": picture}, np.zeros((side, side), bool), 0.3, net)
+    assert asked == [
+        ((352, 352), OUTPUTS),
+        ((448, 448), ("probability", "chord")), ((352, 352), ("device",)),
+    ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
