@@ -60,10 +60,8 @@ class _Own:
     ) -> list[Array]:
         with torch.no_grad():
             vessel, chord, device = self.net(torch.from_numpy(inputs["channels"])).split(1, dim=1)
-        told = dict(
-            zip(OUTPUTS, (torch.sigmoid(vessel), chord, torch.sigmoid(device)), strict=True)
-        )
-        return [told[name].numpy() for name in outputs]
+        told = (torch.sigmoid(vessel), chord, torch.sigmoid(device))
+        return [told[OUTPUTS.index(name)].numpy() for name in outputs]
 
 
 def frozen_segmenter(path: Path) -> Segmenter:

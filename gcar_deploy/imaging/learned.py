@@ -20,7 +20,6 @@ from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
 from gcar_deploy.imaging.device_lines import device_parts
 from gcar_deploy.imaging.net import (
-    FINEST_SIDE,
     NOMINAL_MM,
     SIDE,
     Seen,
@@ -75,7 +74,14 @@ def learned_vessels(
     """
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
-    seen = _seen(segmenter, search, holes)
+    fine = net_input(work, work_holes)
+    coarse, coarse_holes = at_network_size(search, holes, SIDE)
+    if coarse.shape == work.shape:
+        seen = segmenter.look(fine)
+    else:  # devices are looked for at the size that their network learned at
+        vessel, chord = segmenter.answers(fine, ("probability", "chord"))
+        (device_seen,) = segmenter.answers(net_input(coarse, coarse_holes), ("device",))
+        seen = Seen(vessel, chord, segment.resize(device_seen, work.shape[::-1]))
     device = devices(seen, work, work_holes)
     other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
@@ -99,18 +105,6 @@ def learned_vessels(
         device=segment.resize(np.where(work_holes, np.float32(0), seen.device), full),
     )
     return found, path
-
-
-def _seen(segmenter: Segmenter, picture: Image, holes: Mask) -> Seen:
-    """Look for vessels as finely as the network may, for devices at the size that it learned."""
-    fine, coarse = (
-        net_input(*at_network_size(picture, holes, side)) for side in (FINEST_SIDE, SIDE)
-    )
-    if fine.shape == coarse.shape:
-        return segmenter.look(fine)
-    vessel, chord = segmenter.answers(fine, ("probability", "chord"))
-    (device,) = segmenter.answers(coarse, ("device",))
-    return Seen(vessel, chord, segment.resize(device, vessel.shape[::-1]))
 
 
 def devices(seen: Seen, picture: Image, holes: Mask) -> Mask:
