@@ -224,20 +224,21 @@ def test_a_stated_alternative_is_shown_and_picked(serve, browse):
 
 @pytest.mark.slow
 def test_corrections_mend_a_raw_case(serve, engine):
-    """Two ends of vessels that are missed in view 1, painted: DSC from 0.81 to 0.82."""
+    """Two ends of vessels that view 1 lacks and a faint one, painted: DSC from 0.808 to 0.824."""
     import nibabel
 
     folder = ready_case("R_0401")
     truth = np.asarray(nibabel.load(folder / "truth.nii.gz").dataobj) >= 0.5
     given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
-    missed = [[[164, 179], [147, 192]], [[96, 254], [121, 233]]]
+    missed = [[[296, 137], [309, 146], [323, 155]], [[164, 179], [147, 192]],
+              [[96, 254], [121, 233]]]  # fmt: skip
     strokes = [{"do": "paint", "width_px": 9, "points": points} for points in missed]
     corrected = parse_order({**given.to_dict(), "edits": {"1": strokes}})
     found = []
     for order in (given, corrected):
         made = engine.reconstruct_order(order).volume >= 0.5
         found.append(2 * (made & truth).sum() / (made.sum() + truth.sum()))
-    assert found[0] + 0.01 < found[1] and found[1] > 0.815, found
+    assert found[0] + 0.015 < found[1] and found[1] > 0.82, found
 
 
 def test_tools_write_what_they_say(serve, browse):
