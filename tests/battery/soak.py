@@ -12,7 +12,9 @@ import json
 import random
 import sys
 import tempfile
+import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -47,7 +49,7 @@ def soak(count: int, seed: int) -> int:
                 views, scene = scenes[rng.choice(_SCALES)]
                 outcomes[_one(engine, folder, views, scene, rng)] += 1
                 memory.append(_resident_mb())
-                threads.append(_status("Threads"))
+                threads.append(_staying_threads(threads))
                 files.append(len(list(Path("/proc/self/fd").iterdir())))
         same = _reference(engine, folder, scenes) == first
     return _judge(np.array(memory), np.array(threads), np.array(files), outcomes, same)
@@ -141,6 +143,16 @@ def _scaled(scale: int) -> tuple[list[bytes], dict]:
 def _resident_mb() -> float:
     gc.collect(0)
     return _status("VmRSS") / 1024
+
+
+def _staying_threads(before: Sequence[int]) -> int:
+    """Threads of this process; one that was joined may take a moment to leave it."""
+    until = time.monotonic() + 1.0
+    while (count := _status("Threads")) > min(before, default=count):
+        if time.monotonic() > until:
+            break
+        time.sleep(0.005)
+    return count
 
 
 def _status(key: str) -> int:
