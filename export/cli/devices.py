@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 
@@ -23,8 +24,11 @@ _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 @click.option(
     "--pool", type=click.Path(path_type=Path), help="Folder that keeps them, for several runs."
 )
+@click.option("--warm-start", type=_FILE, help="ONNX model whose device network goes on.")
 @click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
-def train_devices(out: Path, pool: Path | None, minutes: float | None, **given: Any) -> None:
+def train_devices(
+    out: Path, pool: Path | None, warm_start: Path | None, minutes: float | None, **given: Any
+) -> None:
     """Train the network that tells catheters, leads and wires; stop and go on at will.
 
     It stands on the segmenter that comes along, which stays as it is. Without options: one CPU
@@ -35,4 +39,4 @@ def train_devices(out: Path, pool: Path | None, minutes: float | None, **given: 
     from gcar_export.training import devices as training
 
     options = training.chosen({k: v for k, v in given.items() if v is not None})
-    training.train(out, options, minutes=minutes, pool=pool)
+    training.train(out, options, minutes=minutes, pool=pool, begin_from=warm_start)

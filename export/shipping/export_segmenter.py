@@ -25,7 +25,7 @@ from gcar_export.shipping.parity import PARITY
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.segmenter_start import begin_with, model_weights
+from gcar_export.training.segmenter_start import begin_with, devices_of
 
 #: seed of the pictures that parity is checked on
 PARITY_SEED = 70_002
@@ -94,8 +94,7 @@ def load_device_checkpoint(path: Path) -> DeviceUNet:
     """Read the checkpoint of ``training.devices`` beside its manifest, or an ONNX model."""
     if path.suffix == ".onnx":
         net = DeviceUNet(DeviceUNetConfig())
-        read = model_weights(path, "devices.")
-        filled(net, {f"net.{name}": value for name, value in read.items()}, path.name)
+        devices_of(net, path)
         return net.eval()
     config = dict(read_manifest(path)["config"])
     config["width"] = tuple(config["width"])

@@ -33,7 +33,7 @@ from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.segmenter import changes, learning_rate, real_pictures
-from gcar_export.training.segmenter_start import frozen_segmenter
+from gcar_export.training.segmenter_start import devices_of, frozen_segmenter
 
 #: pictures of this seed are for choosing, never for training
 VALIDATION_SEED = 90_003
@@ -155,12 +155,23 @@ def validate(net: DeviceUNet, pictures: Pictures) -> dict[str, float]:
 
 
 def train(
-    out: Path, options: DeviceOptions, *, minutes: float | None = None, pool: Path | None = None
+    out: Path,
+    options: DeviceOptions,
+    *,
+    minutes: float | None = None,
+    pool: Path | None = None,
+    begin_from: Path | None = None,
 ) -> None:
     """Train or go on training in ``out``; stop after ``minutes`` if given.
 
     The decay is a function of the step, so a run cut short has not settled: ``finish`` it by a
-    call with fewer ``steps``. Pictures are kept in ``pool``, by default in ``out``.
+    call with fewer ``steps``. Pictures are kept in ``pool``, by default in ``out``. The first
+    weights are random, or those of the model ``begin_from``.
+
+    Raises
+    ------
+    ModelError
+        ``begin_from`` holds no device network of this size.
     """
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
@@ -169,6 +180,7 @@ def train(
     real = real_pictures(options.real, options.fold)
     pictures = Pictures(options, pool or out / "pool", KIND.path, real)
     net = DeviceUNet(DeviceUNetConfig()).train()
+    first = None if begin_from is None else devices_of(net, begin_from)
     # channels_last only orders the memory; the stubs of Module.to do not know it
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(
@@ -182,6 +194,7 @@ def train(
             "seed": options.seed,
             "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
             "segmenter": pictures.sha256,
+            "warm_start": first,
             "data": "gcar_export.scenes.device_pictures"
             + ("; real ones with expert masks tell what is vessel" if options.real else ""),
         },

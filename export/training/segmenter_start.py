@@ -15,6 +15,7 @@ from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging.net import OUTPUTS, Segmenter
 from gcar_deploy.models import Session
 from gcar_deploy.types import Array
+from gcar_export.training.networks.device_unet import DeviceUNet
 from gcar_export.training.networks.mask_unet import MaskUNet
 
 _PREFIX = "net."
@@ -75,6 +76,22 @@ def frozen_segmenter(path: Path) -> Segmenter:
     net = MaskUNet()
     begin_with(net, path)
     return Segmenter(cast(Session, _Own(net.eval())))
+
+
+def devices_of(net: DeviceUNet, model: Path) -> str:
+    """Load the device network of an ONNX model into ``net`` and return the file's SHA-256.
+
+    Raises
+    ------
+    ModelError
+        The model holds none, or one of another size.
+    """
+    found = model_weights(model, "devices.")
+    shapes = {name: tuple(value.shape) for name, value in found.items()}
+    if shapes != {name: tuple(value.shape) for name, value in net.state_dict().items()}:
+        raise ModelError(f"{model.name} holds no device network of this size")
+    net.load_state_dict(found)
+    return hashlib.sha256(model.read_bytes()).hexdigest()
 
 
 def model_weights(path: Path, prefix: str) -> dict[str, torch.Tensor]:

@@ -1,6 +1,7 @@
 """Pictures with devices, the network that learns to tell them, and its way into the model."""
 
 import dataclasses
+import hashlib
 import json
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the export extra")
 
-from gcar_deploy.errors import UsageError  # noqa: E402
+from gcar_deploy.errors import ModelError, UsageError  # noqa: E402
 from gcar_deploy.imaging.net import KIND, SIDE, load_segmenter, open_segmenter  # noqa: E402
 from gcar_export.scenes.cine import cine_pair  # noqa: E402
 from gcar_export.scenes.device_pictures import (  # noqa: E402
@@ -23,7 +24,10 @@ from gcar_export.scenes.device_pictures import (  # noqa: E402
 )
 from gcar_export.scenes.drawn_devices import drawn_devices  # noqa: E402
 from gcar_export.scenes.expert_pictures import expert_pictures  # noqa: E402
-from gcar_export.shipping.export_segmenter import export_segmenter  # noqa: E402
+from gcar_export.shipping.export_segmenter import (  # noqa: E402
+    export_segmenter,
+    load_device_checkpoint,
+)
 from gcar_export.training.devices import (  # noqa: E402
     TINY,
     asked_at_half,
@@ -32,7 +36,7 @@ from gcar_export.training.devices import (  # noqa: E402
     train,
 )
 from gcar_export.training.networks.device_unet import DeviceUNet  # noqa: E402
-from gcar_export.training.segmenter_start import frozen_segmenter  # noqa: E402
+from gcar_export.training.segmenter_start import devices_of, frozen_segmenter  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +179,20 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     same = open_segmenter(again, threads=1).look(channels)
     np.testing.assert_allclose(same.device, after.device, atol=1e-5)
     assert json.loads(again.with_suffix(".json").read_text())["training"] == spec["training"]
+
+
+def test_a_training_goes_on_from_a_model(tmp_path):
+    options = dataclasses.replace(TINY, steps=1, learning_rate=1e-9)
+    train(tmp_path / "run", options, pool=tmp_path / "pool", begin_from=KIND.path)
+    own = load_device_checkpoint(tmp_path / "run" / "checkpoint.safetensors").state_dict()
+    shipped = load_device_checkpoint(KIND.path).state_dict()
+    assert own.keys() == shipped.keys()
+    for name, value in own.items():
+        assert torch.allclose(value, shipped[name], atol=1e-7), name
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["warm_start"] == hashlib.sha256(KIND.path.read_bytes()).hexdigest()
+    with pytest.raises(ModelError, match=r"gcp-multi\.onnx holds no device network"):
+        devices_of(DeviceUNet(), KIND.path.with_name("gcp-multi.onnx"))
 
 
 def test_size_of_the_network():
