@@ -7,6 +7,7 @@ beside it. Pickled checkpoints (``.pt``, ``.pth``) are programs and are not read
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ MAX_BYTES = 2**30
 MAX_MANIFEST_BYTES = 64 * 2**10
 #: widest layer and most stages that a manifest may ask for
 MAX_WIDTH = 4096
+#: entries that hold the mean of the weights (``mean_weights``), where a training kept one
+MEAN = "mean."
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -68,14 +71,20 @@ def read_manifest(path: Path) -> dict[str, Any]:
     return found
 
 
+def prefix_in(tensors: Mapping[str, torch.Tensor]) -> str:
+    """Return what the names of the weights to be used begin with: their mean, if one was kept."""
+    return MEAN if any(name.startswith(MEAN) for name in tensors) else "net."
+
+
 def filled(module: torch.nn.Module, tensors: dict[str, torch.Tensor], name: str) -> None:
-    """Put the ``net.`` tensors into ``module``; names and shapes must be exactly its own.
+    """Put the weights into ``module``; names and shapes must be exactly its own.
 
     Raises
     ------
     ModelError
     """
-    weights = {key[4:]: value for key, value in tensors.items() if key.startswith("net.")}
+    prefix = prefix_in(tensors)
+    weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
     try:
         module.load_state_dict(weights)
     except RuntimeError as error:

@@ -30,6 +30,7 @@ from gcar_export.scenes.device_pictures import (
     turned,
 )
 from gcar_export.scenes.expert_pictures import ExpertPicture
+from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.segmenter import changes, learning_rate, real_pictures
@@ -52,6 +53,7 @@ class DeviceOptions:
     Attributes
     ----------
     pictures : int, that are drawn; each is used many times, turned
+    mean_steps : int, what is kept is the mean of the weights over about so many steps
     real : str, folder of real angiograms with expert masks (``expert_pictures``); empty for none
     fold : (number, of how many) that is left out of them; (0, 0) leaves none out
     """
@@ -65,6 +67,7 @@ class DeviceOptions:
     weight_decay: float = 1e-4
     validation_pictures: int = 24
     save_every: int = 100
+    mean_steps: int = 300
     pictures: int = 1500
     real: str = ""
     fold: tuple[int, int] = (0, 0)
@@ -199,7 +202,8 @@ def train(
             + ("; real ones with expert masks tell what is vessel" if options.real else ""),
         },
     )
-    step = folder.resume(net, optimiser)
+    mean = MeanWeights(net, options.mean_steps)
+    step = folder.resume(net, optimiser, mean.net)
     line = ProgressLine(step, options.steps, options.batch, "pictures")
     began = time.monotonic()
     losses: list[float] = []
@@ -208,11 +212,13 @@ def train(
             group["lr"] = learning_rate(options, step)
         losses.append(_step(net, optimiser, pictures.batch(step)))
         step += 1
+        mean.add(net, step)
         line.show(step, losses)
         if step % options.save_every == 0 and step < options.steps:
-            folder.save(net, optimiser, step)
-    scores = validate(net, pictures)
-    folder.save(net, optimiser, step, {"validation": scores, "validation_seed": VALIDATION_SEED})
+            folder.save(net, optimiser, step, mean=mean.net)
+    scores = validate(mean.net, pictures)
+    told = {"validation": scores, "validation_seed": VALIDATION_SEED}
+    folder.save(net, optimiser, step, told, mean.net)
     folder.log(step, float(np.mean(losses[-100:] or [np.nan])), {"all": scores})
 
 

@@ -28,6 +28,7 @@ from gcar_deploy.errors import ModelError
 from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training.dataset import TrainingScene, training_scene
 from gcar_export.training.examinations import SceneOptions
+from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.scene_stream import in_order
@@ -52,6 +53,8 @@ class TrainOptions:
     clip: float = 1.0
     validation_scenes: int = 24
     save_every: int = 500
+    #: what is kept is the mean of the weights over about so many steps (``mean_weights``)
+    mean_steps: int = 1000
     device: str = "cpu"
     #: forward pass in bfloat16; the loss stays in float32
     bf16: bool = False
@@ -246,7 +249,8 @@ def _replica(rank: int, job: _Job) -> None:
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
-    step = run.resume(net, optimiser)
+    mean = MeanWeights(net, options.mean_steps)
+    step = run.resume(net, optimiser, mean.net)
     held_out = []
     if rank == 0:
         held_out = [
@@ -279,15 +283,16 @@ def _replica(rank: int, job: _Job) -> None:
                 optimiser.step()
             losses.append(float(loss.detach()))
             step += 1
+            mean.add(net, step)
             if rank == 0:
                 line.show(step, losses)
             if rank == 0 and (step % options.save_every == 0 or step == options.steps):
-                scores = validate(net, held_out)
-                run.save(net, optimiser, step, {"validation": scores})
+                scores = validate(mean.net, held_out)
+                run.save(net, optimiser, step, {"validation": scores}, mean.net)
                 run.log(step, float(np.mean(losses[-250:])), scores)
                 _tell(step, scores)
     if rank == 0:
-        run.save(net, optimiser, step)
+        run.save(net, optimiser, step, mean=mean.net)
     if options.replicas > 1:
         torch.distributed.destroy_process_group()
 

@@ -24,6 +24,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import UsageError
+from gcar_export.training.checkpoint import MEAN, prefix_in
 
 SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from
@@ -74,12 +75,22 @@ class RunFolder:
         if "best" in before:
             self.manifest["best"] = before["best"]
 
-    def resume(self, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> int:
-        """Load weights and optimiser state if there are any; return the step reached."""
+    def resume(
+        self,
+        net: torch.nn.Module,
+        optimiser: torch.optim.Optimizer,
+        mean: torch.nn.Module | None = None,
+    ) -> int:
+        """Load weights and optimiser state if there are any; return the step reached.
+
+        ``mean`` takes the mean of the weights, or the weights where none was kept.
+        """
         if not self.checkpoint.is_file():
             return 0
         data = load_file(self.checkpoint)
         load_weights(net, data)
+        if mean is not None:
+            load_weights(mean, data, prefix_in(data))
         state: dict[int, dict[str, torch.Tensor]] = {}
         for n, (name, _) in enumerate(net.named_parameters()):
             prefix = f"opt.{name}."
@@ -96,9 +107,15 @@ class RunFolder:
         optimiser: torch.optim.Optimizer,
         step: int,
         extra: Mapping[str, Any] | None = None,
+        mean: torch.nn.Module | None = None,
     ) -> None:
-        """Write checkpoint and manifest; ``extra`` entries stay in later manifests."""
+        """Write checkpoint and manifest; ``extra`` entries stay in later manifests.
+
+        ``mean`` holds the mean of the weights, which is what will be exported.
+        """
         data = {f"net.{k}": _kept(v) for k, v in net.state_dict().items()}
+        if mean is not None:
+            data |= {f"{MEAN}{k}": _kept(v) for k, v in mean.state_dict().items()}
         for name, p in net.named_parameters():
             for key, value in optimiser.state.get(p, {}).items():
                 data[f"opt.{name}.{key}"] = _kept(value)
@@ -172,9 +189,12 @@ class ProgressLine:
         )
 
 
-def load_weights(net: torch.nn.Module, data: Mapping[str, torch.Tensor]) -> None:
-    """Put the ``net.`` entries of a checkpoint into a network."""
-    net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
+def load_weights(
+    net: torch.nn.Module, data: Mapping[str, torch.Tensor], prefix: str = "net."
+) -> None:
+    """Put the entries of a checkpoint that begin with ``prefix`` into a network."""
+    own = {k.removeprefix(prefix): v for k, v in data.items() if k.startswith(prefix)}
+    net.load_state_dict(own)
 
 
 def read_log(file: Path) -> list[dict[str, str]]:
