@@ -71,6 +71,7 @@ def test_statuses_are_filtered(browse):
     assert cases(page) == ["c10", "c9", LONG]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 820, 390])
 def test_no_column_breaks_and_axe_finds_nothing_serious(browse, width):
     page = browse(width)

@@ -35,6 +35,7 @@ def test_for_people(copy):
     assert "ffr" not in done.out.lower()
 
 
+@pytest.mark.slow
 def test_files_for_solvers(copy, tmp_path):
     done = gcar("flow", copy, "--out", tmp_path / "model")
     assert done.code == 0 and done.out.splitlines()[0] == str(tmp_path / "model")

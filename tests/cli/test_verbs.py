@@ -324,6 +324,7 @@ def test_the_progress_bar_is_for_terminals_only(monkeypatch, capsys):
     assert "refine" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_run_with_the_papers_predictor_and_refinement_is_never_ok(good_case, tmp_path):
     out = tmp_path / "paper"
     pictures = [good_case / f"view{k}.png" for k in (1, 2)]

@@ -84,6 +84,7 @@ def test_a_runs_devices_are_seen_in_its_pictures_and_are_no_vessel():
     assert len(darker) >= 3 and np.mean(darker) > 0.8
 
 
+@pytest.mark.slow
 def test_what_is_asked_of_each_kind_of_picture(segmenter, real):
     for index in range(6):
         made = device_picture(3, index, segmenter, real)

@@ -200,6 +200,7 @@ def engine(monkeypatch, data):
     methods._session.cache_clear()
 
 
+@pytest.mark.slow
 def test_evaluation_writes_tables_and_resumes(data, tmp_path, engine, monkeypatch):
     options = evaluate.EvaluateOptions(
         data=data, out=tmp_path, protocol="paper", methods=("ours", "visual_hull"), views=(2, 4)

@@ -67,6 +67,7 @@ def test_capsules_follow_the_vessel_with_its_radius(folder):
     assert (np.abs(points[share > 0.5].min(0) - low) < 2).all() and (high > low).all()
 
 
+@pytest.mark.slow
 def test_projection_of_capsules_is_that_of_the_mask(folder):
     label = read_label(folder / "a.nii.gz")
     made = capsules_of(label)

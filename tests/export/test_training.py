@@ -208,6 +208,7 @@ def test_a_warm_start_of_another_size_is_refused(tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_scenes_drawn_ahead_are_those_drawn_here():
     draw = functools.partial(training_scene, 7)
     with in_order(draw, range(1, 4), 0) as here, in_order(draw, range(1, 4), 1) as ahead:

@@ -101,6 +101,7 @@ def test_rounding_does_not_turn_a_line_of_one_calibre():
         assert inlets(dataclasses.replace(line, branches=(b,))) == (0,)
 
 
+@pytest.mark.slow
 def test_generated_trees_begin_at_their_ostium():
     """23 of 28 whole and cut trees at least: what is left is cut, or as thick at its far end."""
     from gcar_export.scenes.trees import random_tree

@@ -29,6 +29,7 @@ for generation in range(100000):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.req("REQ-28")
 def test_twenty_kills_never_leave_half_a_folder(tmp_path):

@@ -99,6 +99,7 @@ def test_one_set_of_centres_per_view_of_any_size():
         assert (pixels > -20).all() and (pixels < carm.rows + 20).all()
 
 
+@pytest.mark.slow
 def test_the_result_names_the_predictor(tmp_path):
     angiograms, grid, _ = tiny_case()
     result = Engine(TINY, options=PAPER).reconstruct(angiograms, grid)

@@ -179,6 +179,7 @@ def axes_at(points, told):
     return both / np.linalg.norm(both, axis=2)[:, :, None]
 
 
+@pytest.mark.slow
 def test_errors_of_whole_fits_are_those_that_sigma_states():
     """Pictures by the oracle, view 2 off by draws from the stated prior, noise on the paths.
 

@@ -158,6 +158,7 @@ def repeated_from(engine, case, order: bytes, out: Path) -> dict[str, bytes]:
     return repeated(engine, case, out)
 
 
+@pytest.mark.slow
 def test_raw_case_is_corrected(serve, browse, engine, tmp_path):
     """Erase, landmark pair on its epipolar line, run, delete a branch, undo; the order repeats."""
     from gcar_deploy.geometry.scene import load_scene
@@ -272,6 +273,7 @@ def test_tools_write_what_they_say(serve, browse):
     until_order(page, case, lambda o: "regions" not in o)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 820, 390])
 def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width):
     address, _ = serve(lambda desk: desk.demo().id)
