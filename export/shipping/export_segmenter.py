@@ -22,7 +22,7 @@ from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
-from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
+from gcar_export.training.checkpoint import filled, read_manifest, read_tensors, weights
 from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.segmenter_start import begin_with, devices_of
@@ -86,7 +86,7 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
     config["width"] = tuple(config["width"])
     net = MaskUNet(MaskUNetConfig(**config))
     data = load_file(path)
-    net.load_state_dict({k[4:]: v for k, v in data.items() if k.startswith("net.")})
+    net.load_state_dict(weights(data))
     return net.eval()
 
 

@@ -19,13 +19,13 @@ from gcar_deploy.errors import GeometryError, ModelError
 from gcar_deploy.files import read_bounded
 from gcar_deploy.geometry.fields import read_json
 
-#: weights and the optimiser's two moments of them, in single precision, of some 80 M weights
+#: weights, their mean and the optimiser's two moments, in single precision, of some 60 M weights
 MAX_BYTES = 2**30
 MAX_MANIFEST_BYTES = 64 * 2**10
 #: widest layer and most stages that a manifest may ask for
 MAX_WIDTH = 4096
-#: entries that hold the mean of the weights (``mean_weights``), where a training kept one
-MEAN = "mean."
+#: what names of weights begin with, and of their mean (``mean_weights``) where one was kept
+WEIGHTS, MEAN = "net.", "mean."
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -71,9 +71,14 @@ def read_manifest(path: Path) -> dict[str, Any]:
     return found
 
 
-def prefix_in(tensors: Mapping[str, torch.Tensor]) -> str:
-    """Return what the names of the weights to be used begin with: their mean, if one was kept."""
-    return MEAN if any(name.startswith(MEAN) for name in tensors) else "net."
+def weights(tensors: Mapping[str, torch.Tensor], prefix: str = WEIGHTS) -> dict[str, torch.Tensor]:
+    """Return the entries of a checkpoint that begin with ``prefix``, without it."""
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+
+def best_weights(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return the mean of the weights where one was kept, else the weights."""
+    return weights(tensors, MEAN) or weights(tensors)
 
 
 def filled(module: torch.nn.Module, tensors: dict[str, torch.Tensor], name: str) -> None:
@@ -83,10 +88,8 @@ def filled(module: torch.nn.Module, tensors: dict[str, torch.Tensor], name: str)
     ------
     ModelError
     """
-    prefix = prefix_in(tensors)
-    weights = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
     try:
-        module.load_state_dict(weights)
+        module.load_state_dict(best_weights(tensors))
     except RuntimeError as error:
         raise ModelError(f"{name} does not fit its manifest: {_line(error)}") from None
 

@@ -24,7 +24,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import UsageError
-from gcar_export.training.checkpoint import MEAN, prefix_in
+from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, weights
 
 SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from
@@ -90,7 +90,7 @@ class RunFolder:
         data = load_file(self.checkpoint)
         load_weights(net, data)
         if mean is not None:
-            load_weights(mean, data, prefix_in(data))
+            mean.load_state_dict(best_weights(data))
         state: dict[int, dict[str, torch.Tensor]] = {}
         for n, (name, _) in enumerate(net.named_parameters()):
             prefix = f"opt.{name}."
@@ -113,7 +113,7 @@ class RunFolder:
 
         ``mean`` holds the mean of the weights, which is what will be exported.
         """
-        data = {f"net.{k}": _kept(v) for k, v in net.state_dict().items()}
+        data = {f"{WEIGHTS}{k}": _kept(v) for k, v in net.state_dict().items()}
         if mean is not None:
             data |= {f"{MEAN}{k}": _kept(v) for k, v in mean.state_dict().items()}
         for name, p in net.named_parameters():
@@ -189,12 +189,9 @@ class ProgressLine:
         )
 
 
-def load_weights(
-    net: torch.nn.Module, data: Mapping[str, torch.Tensor], prefix: str = "net."
-) -> None:
-    """Put the entries of a checkpoint that begin with ``prefix`` into a network."""
-    own = {k.removeprefix(prefix): v for k, v in data.items() if k.startswith(prefix)}
-    net.load_state_dict(own)
+def load_weights(net: torch.nn.Module, data: Mapping[str, torch.Tensor]) -> None:
+    """Put the ``net.`` entries of a checkpoint into a network."""
+    net.load_state_dict(weights(data))
 
 
 def read_log(file: Path) -> list[dict[str, str]]:

@@ -29,8 +29,9 @@ from gcar_export.scenes.angiograms import SIDE, training_pair
 from gcar_export.scenes.augmented import augmented_pair
 from gcar_export.scenes.expert_pictures import ExpertPicture, expert_pair, expert_pictures, folds
 from gcar_export.scenes.picture_pool import pooled
+from gcar_export.training.checkpoint import weights
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.segmenter_start import begin_with, weights
+from gcar_export.training.segmenter_start import begin_with
 
 #: pictures with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002

@@ -15,15 +15,9 @@ from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging.net import OUTPUTS, Segmenter
 from gcar_deploy.models import Session
 from gcar_deploy.types import Array
+from gcar_export.training.checkpoint import WEIGHTS, weights
 from gcar_export.training.networks.device_unet import DeviceUNet
 from gcar_export.training.networks.mask_unet import MaskUNet
-
-_PREFIX = "net."
-
-
-def weights(data: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the network's part of a checkpoint."""
-    return {k.removeprefix(_PREFIX): v for k, v in data.items() if k.startswith(_PREFIX)}
 
 
 def begin_with(net: MaskUNet, path: Path) -> str:
@@ -36,7 +30,7 @@ def begin_with(net: MaskUNet, path: Path) -> str:
     ModelError
         A weight is missing or has another shape.
     """
-    found = model_weights(path, _PREFIX) if path.suffix == ".onnx" else weights(load_file(path))
+    found = model_weights(path, WEIGHTS) if path.suffix == ".onnx" else weights(load_file(path))
     own = net.state_dict()
     for name, value in own.items():
         given = found.get(name)
@@ -86,11 +80,10 @@ def devices_of(net: DeviceUNet, model: Path) -> str:
     ModelError
         The model holds none, or one of another size.
     """
-    found = model_weights(model, "devices.")
-    shapes = {name: tuple(value.shape) for name, value in found.items()}
-    if shapes != {name: tuple(value.shape) for name, value in net.state_dict().items()}:
-        raise ModelError(f"{model.name} holds no device network of this size")
-    net.load_state_dict(found)
+    try:
+        net.load_state_dict(model_weights(model, "devices."))
+    except RuntimeError:
+        raise ModelError(f"{model.name} holds no device network of this size") from None
     return hashlib.sha256(model.read_bytes()).hexdigest()
 
 

@@ -148,7 +148,7 @@ def _resident_mb() -> float:
 def _staying_threads(before: Sequence[int]) -> int:
     """Threads of this process; one that was joined may take a moment to leave it."""
     until = time.monotonic() + 1.0
-    while (count := _status("Threads")) > min(before, default=count):
+    while (count := _status("Threads")) > (before[-1] if before else count):
         if time.monotonic() > until:
             break
         time.sleep(0.005)
