@@ -29,12 +29,12 @@ _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 def train_devices(
     out: Path, pool: Path | None, warm_start: Path | None, minutes: float | None, **given: Any
 ) -> None:
-    """Train the network that tells catheters, leads and wires; stop and go on at will.
+    """Train the network that tells catheters, leads and wires along lines; stop and go on at will.
 
-    It stands on the segmenter that comes along, which stays as it is. Without options: one CPU
-    core for an hour and a half, no real pictures.
+    It looks along the lines that the segmenter that comes along finds, which stays as it is.
+    Without options: one CPU core for two hours, most of them to draw pictures; none are real.
 
-    Example: gcar-export train-devices --out runs/d --real xca_masks --fold 1/2 --minutes 45
+    Example: gcar-export train-devices --out runs/d --real xca_masks --pictures 3400
     """
     from gcar_export.training import devices as training
 

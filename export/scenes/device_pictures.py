@@ -1,9 +1,10 @@
-"""Pictures that a network learns catheters, leads and wires from, ready for it.
+"""Pictures whose lines a network learns catheters, leads and wires from, ready for it.
 
-Of each three one is a frame of a generated run (``cine``), one a generated angiogram
-(``angiograms``), one a real angiogram with the vessels as an expert drew them, where there are
-any. Most get further devices (``drawn_devices``). All are whole pictures, as at run time: where a
-picture ends says where devices come from. The segmenter's answer is part of the input.
+Of each four one is a frame of a generated run (``cine``), one a generated angiogram
+(``angiograms``), one a raw picture of a generated tree (``raw_pictures``), one a real angiogram
+with the vessels as an expert drew them, where there are any. Most get further devices
+(``drawn_devices``). All are whole pictures, as at run time: where a picture ends says where devices
+come from. What is kept of a picture are its lines, as the run time looks along them.
 """
 
 from __future__ import annotations
@@ -14,42 +15,50 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from gcar_deploy.imaging import learned, line_chains, line_strips
+from gcar_deploy.imaging.learned import vessel_lines
+from gcar_deploy.imaging.line_strips import POINT, LinePoints, line_points
 from gcar_deploy.imaging.net import SIDE, Segmenter
-from gcar_deploy.types import Array, Image, Mask
+from gcar_deploy.types import Array, Mask
 from gcar_export.scenes import augmented, cine, drawn_devices, picture_pool
 from gcar_export.scenes.angiograms import PERHAPS_PX, generated_angiogram
 from gcar_export.scenes.augmented import Labelled, augmented_pair
 from gcar_export.scenes.cine import cine_pair
 from gcar_export.scenes.drawn_devices import drawn_devices as drawn
 from gcar_export.scenes.expert_pictures import ExpertPicture
+from gcar_export.scenes.protocols import clinical_geometry
+from gcar_export.scenes.raw_pictures import random_options, raw_picture
+from gcar_export.scenes.render import path_lengths
+from gcar_export.scenes.trees import random_tree, rough_style, thin_style
 
 #: enlargement of a picture that fills the network's field, and how far it is turned, degrees
 ZOOM, TURN_DEG = (1.0, 1.2), 8.0
 #: of the pictures this share gets further devices; what they absorb at least to be one
 FURTHER, SEEN = 0.6, 0.02
-#: a step between the numbers of patients, and of angiograms, of two seeds
-_SEED = 31_000
-#: weight of what is neither vessel nor device where that is known, and of a vessel
-GROUND, VESSEL = 0.2, 2.0
+#: a step between the numbers of patients, and of angiograms, of two seeds; angles of raw pictures
+#: vary by so much, degrees
+_SEED, _SPREAD_DEG = 31_000, 12.0
+#: what a point of a line is; of an expert's picture only what is no vessel is known
+VESSEL, DEVICE, OTHER, NO_VESSEL, NOT_ASKED = 0, 1, 2, 3, -1
+#: so near to a vessel, and to a device, nobody says which a line is, pixels to each side
+_NEAR_VESSEL, _NEAR_DEVICE = np.ones((5, 5), np.uint8), np.ones((3, 3), np.uint8)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DevicePicture:
-    """One picture as the network is given it.
+    """The lines of one picture.
 
     Attributes
     ----------
-    channels : (6, SIDE, SIDE) float16: ``net.net_input``, then the probability, the chord and the
-        own device map of the segmenter
-    device : (SIDE, SIDE) bool
-    weight : (SIDE, SIDE) float16, how much a pixel counts; 0 where nobody knows
+    lines : LinePoints
+    label : (n,) int8, ``VESSEL`` .. ``NOT_ASKED`` of each point
     """
 
-    channels: Array
-    device: Mask
-    weight: Array
+    lines: LinePoints
+    label: Array
 
 
 def device_picture(
@@ -57,25 +66,25 @@ def device_picture(
 ) -> DevicePicture:
     """Picture ``index`` of a stream; the same for the same arguments."""
     rng = np.random.default_rng([seed, index, 6])
-    kind = index % 3
+    kind, expert = index % 4, False
     if kind == 2 and real:
         chosen = real[int(rng.integers(len(real)))]
-        pixels, vessel = chosen.pixels, chosen.mask
-        device, ground = np.zeros_like(vessel), np.float32(0)
-    elif kind == 1:
+        pixels, vessel, expert = chosen.pixels, chosen.mask, True
+        device = np.zeros_like(vessel)
+    elif kind == 0:
+        pixels, vessel, device = _frame(rng, _SEED + seed, index)
+    elif kind == 3:
+        pixels, vessel = _raw(rng)
+        device = np.zeros_like(vessel)
+    else:
         made = generated_angiogram(_SEED + seed, index)
         pixels, vessel, device = made.pixels, made.path_px > PERHAPS_PX, made.device
-        ground = np.float32(GROUND)
-    else:
-        pixels, vessel, device = _frame(rng, _SEED + seed, index)
-        ground = np.float32(GROUND)
-    shape = min(vessel.shape)
-    if rng.random() < FURTHER and vessel.shape == (shape, shape):
-        absorbed = drawn(rng, shape)
-        pixels = np.asarray(pixels, np.float32) * np.exp(-absorbed)
+    pixels = np.asarray(pixels, np.float32)
+    if rng.random() < FURTHER and vessel.shape[0] == vessel.shape[1]:
+        absorbed = drawn(rng, vessel.shape[0])
+        pixels = pixels * np.exp(-absorbed)
         device = (device | (absorbed > SEEN)) & ~vessel
-    weight = np.where(vessel, np.float32(VESSEL), np.where(device, np.float32(1), ground))
-    return _ready(rng, np.asarray(pixels, np.float32), vessel, device, weight, segmenter)
+    return _looked_at(rng, pixels, vessel, device, expert, segmenter)
 
 
 def _frame(rng: np.random.Generator, seed: int, index: int) -> tuple[Array, Mask, Mask]:
@@ -87,23 +96,51 @@ def _frame(rng: np.random.Generator, seed: int, index: int) -> tuple[Array, Mask
     return run.pixels[frame], run.path_mm[frame] > least, run.device[frame]
 
 
-def _ready(
-    rng: np.random.Generator, pixels: Image, vessel: Mask, device: Mask, weight: Image,
+def _raw(rng: np.random.Generator) -> tuple[Array, Mask]:
+    """Pixels and vessel of a raw picture of a generated tree, of any contrast and display."""
+    style = [None, thin_style(rng), rough_style(rng)][int(rng.integers(3))]
+    tree = random_tree(rng, style)
+    carm = clinical_geometry(2)[0][int(rng.integers(2))].turned(*(_SPREAD_DEG * rng.normal(size=2)))
+    path_mm = path_lengths(carm, *tree.segments())
+    pixels = raw_picture(path_mm, rng, random_options(rng))
+    return pixels, path_mm > PERHAPS_PX * carm.pixel_at_isocenter_mm
+
+
+def _looked_at(
+    rng: np.random.Generator, pixels: Array, vessel: Mask, device: Mask, expert: bool,
     segmenter: Segmenter,
 ) -> DevicePicture:  # fmt: skip
-    """Bring a picture to the network's size, never twice the same, and ask the segmenter."""
-    zero = np.zeros_like(weight)
+    """Bring a picture to the network's size, never twice the same, and look along its lines."""
+    zero = np.zeros(vessel.shape, np.float32)
     scale = SIDE / float(np.sqrt(pixels.size))
-    layers = np.stack([vessel, weight, zero, device, zero, zero]).astype(np.float32)
+    layers = np.stack([vessel, zero, zero, device, zero, zero]).astype(np.float32)
     given = Labelled(pixels, layers, (scale * ZOOM[0], scale * ZOOM[1]))
     channels, truth = augmented_pair(rng, given, SIDE, TURN_DEG)
     seen = segmenter.look(channels)
-    answers = np.stack([seen.probability, seen.chord, seen.device])
-    return DevicePicture(
-        channels=np.concatenate([channels, answers]).astype(np.float16),
-        device=truth[3] > 0.5,
-        weight=truth[1].astype(np.float16),
-    )
+    dark = (np.abs(channels).sum(axis=0) == 0).astype(np.uint8)
+    holes = cv2.morphologyEx(dark, cv2.MORPH_OPEN, _NEAR_VESSEL) > 0
+    line = vessel_lines(np.where(holes, np.float32(0), seen.probability))[1]
+    maps = np.concatenate([channels, seen.probability[None], seen.chord[None]])
+    lines = line_points(maps, line, holes) if line.any() else None
+    if lines is None:
+        return DevicePicture(no_lines(), np.zeros(0, np.int8))
+    label = labels(truth[0] > 0.5, truth[3] > 0.5, expert)
+    return DevicePicture(lines, label[lines.pixels[:, 0], lines.pixels[:, 1]])
+
+
+def labels(vessel: Mask, device: Mask, expert: bool) -> Array:
+    """(rows, cols) int8, what a line is there; ``expert``: only vessels were drawn."""
+    beside = cv2.dilate(vessel.astype(np.uint8), _NEAR_VESSEL) > 0
+    on_device = cv2.dilate(device.astype(np.uint8), _NEAR_DEVICE) > 0
+    out = np.where(on_device, DEVICE, NO_VESSEL if expert else OTHER)
+    out = np.where(beside, NOT_ASKED, out)
+    return np.where(vessel, VESSEL, out).astype(np.int8)
+
+
+def no_lines() -> LinePoints:
+    """Lines of a picture that has none."""
+    none = np.zeros((0, 2), np.int64)
+    return LinePoints(none, np.zeros((0, POINT), np.float32), none, ())
 
 
 def generator(segmenter: str, real: Sequence[ExpertPicture]) -> str:
@@ -111,7 +148,7 @@ def generator(segmenter: str, real: Sequence[ExpertPicture]) -> str:
 
     ``segmenter``: SHA-256 of its file.
     """
-    modules = (augmented, cine, drawn_devices)
+    modules = (augmented, cine, drawn_devices, learned, line_chains, line_strips)
     texts = [Path(str(m.__file__)).read_bytes() for m in modules] + [Path(__file__).read_bytes()]
     names = " ".join(picture.name for picture in real)
     words = f"{picture_pool.generator()} {segmenter} {names}"
@@ -132,28 +169,13 @@ def pooled_device_picture(
         folder.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(f".{os.getpid()}.tmp")
         with part.open("wb") as file:
-            np.savez(file, channels=made.channels, device=made.device, weight=made.weight)
+            np.savez(
+                file, points=made.lines.points.astype(np.float16), label=made.label,
+                pixels=made.lines.pixels.astype(np.int16), lengths=made.lines.lengths,
+            )  # fmt: skip
         part.replace(path)
     with np.load(path) as data:
-        return DevicePicture(data["channels"], data["device"], data["weight"])
-
-
-def turned(rng: np.random.Generator, picture: DevicePicture) -> DevicePicture:
-    """Flip and transpose at random."""
-    arrays = [picture.channels, picture.device, picture.weight]
-    flip = rng.integers(0, 2, 3)
-    for axis in (-1, -2):
-        if flip[axis]:
-            arrays = [np.flip(a, axis) for a in arrays]
-    if flip[2]:
-        arrays = [np.swapaxes(a, -1, -2) for a in arrays]
-    return DevicePicture(*(np.ascontiguousarray(a) for a in arrays))
-
-
-def cropped(rng: np.random.Generator, picture: DevicePicture, side: int) -> DevicePicture:
-    """Cut a square of ``side`` pixels out, anywhere."""
-    top, left = rng.integers(0, picture.device.shape[0] - side + 1, 2)
-    part = slice(top, top + side), slice(left, left + side)
-    return DevicePicture(
-        *(a[..., *part] for a in (picture.channels, picture.device, picture.weight))
-    )
+        lengths = tuple(int(n) for n in data["lengths"])
+        near = line_strips.near_points(lengths)
+        points = data["points"].astype(np.float32)
+        return DevicePicture(LinePoints(data["pixels"], points, near, lengths), data["label"])

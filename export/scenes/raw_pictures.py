@@ -44,6 +44,22 @@ class RawOptions:
     saturated: float = 0.002
 
 
+def random_options(rng: np.random.Generator) -> RawOptions:
+    """Draw how a pair of pictures is taken and displayed."""
+
+    def between(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def about(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    return RawOptions(
+        contrast_per_mm=about(0.05, 0.22), background=between(0.05, 0.25), spine=between(0, 0.25),
+        rib=between(0, 0.1), diaphragm=between(0, 0.5), photons=about(300, 8000),
+        blur_px=between(0.5, 1.6), gamma=between(0.5, 1.6), saturated=about(0.0003, 0.003),
+    )  # fmt: skip
+
+
 def raw_picture(
     path_mm: Image, rng: np.random.Generator, options: RawOptions | None = None
 ) -> NDArray[np.uint8]:

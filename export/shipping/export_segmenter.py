@@ -1,6 +1,6 @@
 """From checkpoints of the segmentation network to one ONNX file with its spec, and the proof.
 
-One file holds two networks: the segmenter, and the one that tells devices from its answers.
+One file holds two networks: the segmenter, and the one that tells devices along its lines.
 """
 
 from __future__ import annotations
@@ -15,15 +15,25 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
-from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import INPUT, KIND, OUTPUTS, STRIDE, Segmenter, open_segmenter
+from gcar_deploy.errors import ModelError, UsageError
+from gcar_deploy.imaging.line_strips import NEAR, POINT, line_points
+from gcar_deploy.imaging.net import (
+    INPUT,
+    INPUTS,
+    KIND,
+    OUTPUTS,
+    STRIDE,
+    Segmenter,
+    open_segmenter,
+)
+from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.models import Session
 from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors, weights
-from gcar_export.training.networks.device_unet import DeviceUNet, DeviceUNetConfig
+from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.segmenter_start import begin_with, devices_of
 
@@ -56,24 +66,21 @@ class _GroupNorm(torch.nn.Module):
 
 
 class _Deployed(torch.nn.Module):
-    """Both networks as one: probability, chords, probability of a device."""
+    """Both networks as one: probability and chords of a picture, devices of its lines."""
 
-    def __init__(self, net: MaskUNet, devices: DeviceUNet | None) -> None:
+    def __init__(self, net: MaskUNet, devices: LineNet) -> None:
         super().__init__()
         self.net, self.devices = net, devices
-        for part in [*net.modules(), *(devices.modules() if devices else ())]:
+        for part in list(net.modules()):
             for name, norm in list(part.named_children()):
                 if isinstance(norm, torch.nn.GroupNorm):
                     setattr(part, name, _GroupNorm(norm))
 
-    def forward(self, channels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        logit, chord, device = self.net(channels).split(1, dim=1)
-        vessel, device = torch.sigmoid(logit), torch.sigmoid(device)
-        if self.devices is not None:
-            half = self.devices(torch.cat([channels, vessel, chord, device], dim=1))
-            finer = torch.nn.functional.interpolate(half, scale_factor=2.0, mode="bilinear")
-            device = torch.sigmoid(finer)
-        return vessel, chord, device
+    def forward(
+        self, channels: torch.Tensor, points: torch.Tensor, near: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        logit, chord, _ = self.net(channels).split(1, dim=1)
+        return torch.sigmoid(logit), chord, no_vessel(self.devices(points, near))
 
 
 def load_segmenter_checkpoint(path: Path) -> MaskUNet:
@@ -90,15 +97,13 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
     return net.eval()
 
 
-def load_device_checkpoint(path: Path) -> DeviceUNet:
-    """Read the checkpoint of ``training.devices`` beside its manifest, or an ONNX model."""
+def load_device_checkpoint(path: Path) -> LineNet:
+    """Read the checkpoint of ``training.devices`` beside its manifest, or an ONNX model's."""
     if path.suffix == ".onnx":
-        net = DeviceUNet(DeviceUNetConfig())
+        net = LineNet(LineNetConfig())
         devices_of(net, path)
         return net.eval()
-    config = dict(read_manifest(path)["config"])
-    config["width"] = tuple(config["width"])
-    net = DeviceUNet(DeviceUNetConfig(**config))
+    net = LineNet(LineNetConfig(**read_manifest(path)["config"]))
     filled(net, read_tensors(path), path.name)
     return net.eval()
 
@@ -106,21 +111,34 @@ def load_device_checkpoint(path: Path) -> DeviceUNet:
 class _CheckpointSession:
     """Answers as ``models.Session`` does, from checkpoints that were not exported."""
 
-    def __init__(self, checkpoint: Path, devices: Path | None) -> None:
-        told = None if devices is None else load_device_checkpoint(devices)
+    def __init__(self, checkpoint: Path, devices: Path) -> None:
+        told = load_device_checkpoint(devices)
         self.net = _Deployed(load_segmenter_checkpoint(checkpoint), told).eval()
 
     def run(
         self, inputs: Mapping[str, Array], *_: object, outputs: Sequence[str], **__: object
     ) -> list[Array]:
         with torch.no_grad():
-            told = self.net(torch.from_numpy(inputs["channels"]))
+            told = self.net(*(torch.from_numpy(inputs[name]) for name in INPUTS))
         return [told[OUTPUTS.index(name)].numpy() for name in outputs]
 
 
 def checkpoint_segmenter(checkpoint: Path, devices: Path | None = None) -> Segmenter:
     """Open checkpoints as if they were a model, for looking at them."""
-    return Segmenter(cast(Session, _CheckpointSession(checkpoint, devices)))
+    return Segmenter(cast(Session, _CheckpointSession(checkpoint, devices or shipped())))
+
+
+def shipped() -> Path:
+    """Return the model that comes along: its network of lines is taken where no other is named.
+
+    Raises
+    ------
+    UsageError
+        None is installed.
+    """
+    if KIND.path is None:
+        raise UsageError("no segmenter is installed whose network of lines could be taken")
+    return KIND.path
 
 
 def export_segmenter(
@@ -133,8 +151,8 @@ def export_segmenter(
     checkpoint : of the segmenter, or an ONNX model whose segmenter is taken as it is
     out : the file
     pictures : generated ones that torch and ONNX Runtime are compared on
-    devices : checkpoint of the device network, or an ONNX model that holds one; None: the
-        segmenter's own answer stays
+    devices : checkpoint of the network of lines, or an ONNX model that holds one; None: the model
+        that comes along
 
     Returns
     -------
@@ -148,19 +166,21 @@ def export_segmenter(
     """
     import onnx
 
-    told = None if devices is None else load_device_checkpoint(devices)
-    net = _Deployed(load_segmenter_checkpoint(checkpoint), told).eval()
+    devices = devices or shipped()
+    net = _Deployed(load_segmenter_checkpoint(checkpoint), load_device_checkpoint(devices)).eval()
     example = torch.zeros(1, INPUT["channels"], 8 * STRIDE, 9 * STRIDE)
+    points, near = torch.zeros(50, POINT), torch.zeros(50, NEAR, dtype=torch.int64)
     rows, cols = (torch.export.Dim(n, min=2, max=512) for n in ("rows", "cols"))
+    count = torch.export.Dim("count", min=2, max=10**6)
     program: Any = torch.onnx.export(
         net,
-        (example,),
+        (example, points, near),
         dynamo=True,
         opset_version=OPSET,
         external_data=False,
-        input_names=["channels"],
+        input_names=list(INPUTS),
         output_names=list(OUTPUTS),
-        dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols},),
+        dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols}, {0: count}, {0: count}),
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     program.save(str(out), external_data=False)
@@ -183,16 +203,16 @@ def export_segmenter(
     return worst
 
 
-def _training(checkpoint: Path, devices: Path | None) -> dict[str, Any]:
+def _training(checkpoint: Path, devices: Path) -> dict[str, Any]:
     """Say what both were trained on, as the manifests beside them do."""
     if checkpoint.suffix == ".onnx":
         training = dict(json.loads(checkpoint.with_suffix(".json").read_text())["training"])
     else:
         training = json.loads((checkpoint.parent / "manifest.json").read_text())
-    if devices is not None and devices.suffix == ".onnx":
+    if devices.suffix == ".onnx":
         told = json.loads(devices.with_suffix(".json").read_text())
         training["devices"] = told["training"]["devices"]
-    elif devices is not None:
+    else:
         training["devices"] = read_manifest(devices)
     return training
 
@@ -223,11 +243,16 @@ def _largest_difference(net: torch.nn.Module, out: Path, pictures: int) -> float
         channels = training_pair(PARITY_SEED, k)[0]
         if k % 2:  # another shape than the one it was traced with
             channels = np.ascontiguousarray(channels[:, : -3 * STRIDE, :-STRIDE])
-        with torch.no_grad():
-            torch_maps = [m.numpy()[0, 0] for m in net(torch.from_numpy(channels)[None])]
         seen = session.look(channels)
-        difference = np.abs(torch_maps[0] - seen.probability)
-        relative = np.abs(torch_maps[1] - seen.chord) / (1 + torch_maps[1])
-        devices = np.abs(torch_maps[2] - seen.device)
+        maps = np.concatenate([channels, seen.probability[None], seen.chord[None]])
+        lines = line_points(maps, skeletonize(seen.probability > 0.5), maps[0] > np.inf)
+        if lines is None:
+            continue
+        given = (channels[None], lines.points, lines.near)
+        with torch.no_grad():
+            told = [m.numpy() for m in net(*map(torch.from_numpy, given))]
+        difference = np.abs(told[0][0, 0] - seen.probability)
+        relative = np.abs(told[1][0, 0] - seen.chord) / (1 + told[1][0, 0])
+        devices = np.abs(told[2] - session.devices(lines))
         worst = max(worst, *(float(d.max()) for d in (difference, relative, devices)))
     return worst

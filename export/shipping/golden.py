@@ -8,6 +8,7 @@ import numpy as np
 
 from gcar_deploy.config import CandidateOptions
 from gcar_deploy.errors import UsageError
+from gcar_deploy.imaging.line_strips import POINT, near_points
 from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.imaging.net import open_segmenter
 from gcar_deploy.models import (
@@ -27,6 +28,8 @@ from gcar_deploy.selftest import tiny_case
 
 #: points of the case: enough for every level and for rays of several points, small on disk
 POINTS = 500
+#: lengths of the lines of the case
+LINES = (7, 40, 90)
 
 
 def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
@@ -36,8 +39,11 @@ def golden_inputs(model: ModelFile) -> dict[str, np.ndarray]:
     views = [(a.carm, a.pixels * np.float32(a.intensity.mm_per_count)) for a in angiograms]
     if model.kind == SEGMENTER.name:
         shape = (1, int(model.inputs["channels"]), 64, 64)
-        noise = np.random.default_rng(0).normal(size=shape)
-        return {"channels": np.clip(noise, -1, 2).astype(np.float32)}
+        rng = np.random.default_rng(0)
+        noise, near = rng.normal(size=shape), near_points(LINES)
+        points = rng.normal(size=(len(near), POINT)).astype(np.float32)
+        channels = np.clip(noise, -1, 2).astype(np.float32)
+        return {"channels": channels, "points": points, "near": near}
     if model.kind == "paper":
         picture = net_picture(*views[0], int(model.inputs["pixels"]))
         arrays = [picture.network_input(), picture.axes_input()]

@@ -27,7 +27,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Points
 from gcar_export.scenes.protocols import clinical_geometry
-from gcar_export.scenes.raw_pictures import RawOptions, raw_picture
+from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import random_tree, rough_style, thin_style
 from gcar_export.studies.pair_rows import Judged, head, row
@@ -51,22 +51,6 @@ class RawPair:
     line_mm: Points
 
 
-def raw_options(rng: np.random.Generator) -> RawOptions:
-    """Draw how a pair of pictures is taken and displayed."""
-
-    def between(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
-
-    def about(low: float, high: float) -> float:
-        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-    return RawOptions(
-        contrast_per_mm=about(0.05, 0.22), background=between(0.05, 0.25), spine=between(0, 0.25),
-        rib=between(0, 0.1), diaphragm=between(0, 0.5), photons=about(300, 8000),
-        blur_px=between(0.5, 1.6), gamma=between(0.5, 1.6), saturated=about(0.0003, 0.003),
-    )  # fmt: skip
-
-
 def raw_pair(seed: int, number: int) -> RawPair:
     """Simulate the examination of tree ``number``: even ones are left, odd ones right."""
     rng = np.random.default_rng([seed, number])
@@ -74,7 +58,7 @@ def raw_pair(seed: int, number: int) -> RawPair:
     tree = random_tree(rng, style).sides(SIDES[number % 2])
     carms, _, grid = clinical_geometry(2)
     turned = [carm.turned(*(SPREAD_DEG * rng.normal(size=2))) for carm in carms]
-    options = raw_options(rng)
+    options = random_options(rng)
     one, two = (
         Angiogram(
             view_id=str(k + 1), carm=carm, bit_depth=8, intensity=Intensity(kind="raw"),

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
 from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.imaging.net import OUTPUTS, Segmenter
-from gcar_deploy.models import Session
-from gcar_deploy.types import Array
 from gcar_export.training.checkpoint import WEIGHTS, weights
-from gcar_export.training.networks.device_unet import DeviceUNet
+from gcar_export.training.networks.line_net import LineNet
 from gcar_export.training.networks.mask_unet import MaskUNet
 
 
@@ -44,47 +39,36 @@ def begin_with(net: MaskUNet, path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-class _Own:
-    """Answers as ``models.Session`` does, with the segmenter's own word on devices."""
-
-    def __init__(self, net: MaskUNet) -> None:
-        self.net = net
-
-    def run(
-        self, inputs: Mapping[str, Array], *_: object, outputs: Sequence[str], **__: object
-    ) -> list[Array]:
-        with torch.no_grad():
-            vessel, chord, device = self.net(torch.from_numpy(inputs["channels"])).split(1, dim=1)
-        told = (torch.sigmoid(vessel), chord, torch.sigmoid(device))
-        return [told[OUTPUTS.index(name)].numpy() for name in outputs]
-
-
-def frozen_segmenter(path: Path) -> Segmenter:
-    """Open the segmenter of a model or checkpoint as what a device network stands on.
-
-    Raises
-    ------
-    ModelError
-        As ``begin_with``.
-    """
-    net = MaskUNet()
-    begin_with(net, path)
-    return Segmenter(cast(Session, _Own(net.eval())))
-
-
-def devices_of(net: DeviceUNet, model: Path) -> str:
-    """Load the device network of an ONNX model into ``net`` and return the file's SHA-256.
+def devices_of(net: LineNet, model: Path) -> str:
+    """Load the network of lines of an ONNX model into ``net`` and return the file's SHA-256.
 
     Raises
     ------
     ModelError
         The model holds none, or one of another size.
     """
+    import onnx
+    from onnx import numpy_helper
+
+    prefix = "devices."
+    found = {
+        one.name.removeprefix(prefix): torch.from_numpy(numpy_helper.to_array(one).copy())
+        for one in onnx.load(str(model)).graph.initializer
+        if one.name.startswith(prefix)
+    }
     try:
-        net.load_state_dict(model_weights(model, "devices."))
+        net.load_state_dict(found)
     except RuntimeError:
-        raise ModelError(f"{model.name} holds no device network of this size") from None
+        raise ModelError(f"{model.name} holds no network of lines of this size") from None
     return hashlib.sha256(model.read_bytes()).hexdigest()
+
+
+def vessels_sha256(model: Path) -> str:
+    """SHA-256 of the weights that find vessels: the network of lines in the file is left out."""
+    digest = hashlib.sha256()
+    for name, value in sorted(model_weights(model, WEIGHTS).items()):
+        digest.update(name.encode() + value.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def model_weights(path: Path, prefix: str) -> dict[str, torch.Tensor]:

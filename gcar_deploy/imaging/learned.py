@@ -18,7 +18,7 @@ from gcar_deploy.imaging import enhance, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
-from gcar_deploy.imaging.device_lines import device_parts
+from gcar_deploy.imaging.device_lines import device_map, device_parts
 from gcar_deploy.imaging.net import (
     NOMINAL_MM,
     SIDE,
@@ -42,9 +42,9 @@ CONTRAST_SHARE = 0.1
 #: paths are averaged over so much of the line before they say where the rim is, and blurred by so
 #: much, pixels of the network
 _ALONG_PX, _BLUR_PX = 3.0, 0.7
-#: a line of one picture alone is left out where it is so probably a device, as long as no more than
-#: this share of the vessels' line goes
-ALONE_LEVEL, ALONE_SHARE = 0.92, 0.5
+#: a line of one picture alone is left out where it is so probably no vessel, as long as no more
+#: than this share of all lines goes
+DEVICE_LEVEL, DEVICE_SHARE = 0.9, 0.8
 
 
 def learned_vessels(
@@ -75,14 +75,10 @@ def learned_vessels(
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
     fine = net_input(work, work_holes)
-    coarse, coarse_holes = at_network_size(search, holes, SIDE)
-    if coarse.shape == work.shape:
-        seen = segmenter.look(fine)
-    else:  # devices are looked for at the size that their network learned at
-        vessel, chord = segmenter.answers(fine, ("probability", "chord"))
-        (device_seen,) = segmenter.answers(net_input(coarse, coarse_holes), ("device",))
-        seen = Seen(vessel, chord, segment.resize(device_seen, work.shape[::-1]))
-    device = devices(seen, work, work_holes)
+    seen = segmenter.look(fine)
+    reach, line = vessel_lines(np.where(work_holes, np.float32(0), seen.probability))
+    told = device_map(segmenter, fine, seen, line, reach, work_holes)
+    device = devices(told, reach, line, work, work_holes)
     other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]
@@ -102,20 +98,17 @@ def learned_vessels(
         vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
         catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~mask,
         catheter_mm=int(skel.skeletonize(device).sum()) * float(work_mm),
-        device=segment.resize(np.where(work_holes, np.float32(0), seen.device), full),
+        device=segment.resize(told, full),
     )
     return found, path
 
 
-def devices(seen: Seen, picture: Image, holes: Mask) -> Mask:
-    """(rows, cols) bool: lines that are catheters, leads or wires.
+def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -> Mask:
+    """(rows, cols) bool: lines that are no vessels, as wide as they reach.
 
-    By their course among the vessels, or by what the network says along vessels and devices
-    together: it takes parts of a catheter for a device and parts for a vessel. Pixels are taken for
-    as large as the network's filters take them.
+    By what the network of lines says, or by their course among the vessels. Pixels are taken for as
+    large as the network's filters take them.
     """
-    vessel = np.where(holes, np.float32(0), seen.probability)
-    reach, line = _line(vessel)
     if not line.any():
         return np.zeros_like(reach)
     filled = enhance.fill_holes(picture, holes)
@@ -124,16 +117,15 @@ def devices(seen: Seen, picture: Image, holes: Mask) -> Mask:
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / pixel_mm)
     sigma_px = enhance.ridges(flat, pixel_mm).sigma_px
     found = skel.beside_alone(reach, line, catheters(line, flat, sigma_px, ~holes, pixel_mm))
-    reach, either = _line(np.where(holes, np.float32(0), np.maximum(vessel, seen.device)))
-    for part in device_parts(either, seen.device, ~holes, ALONE_LEVEL, finer):
-        more = found | skel.beside_alone(reach, either, part)
-        # A small tree behind a long catheter may be taken for one with it.
-        if (more & line).sum() <= ALONE_SHARE * line.sum():
+    for part in device_parts(line, told, DEVICE_LEVEL, finer):
+        more = found | skel.beside_alone(reach, line, part)
+        # A picture of devices alone is for others to refuse.
+        if (more & line).sum() <= DEVICE_SHARE * line.sum():
             found = more
     return found
 
 
-def _line(probability: Image) -> tuple[Mask, Mask]:
+def vessel_lines(probability: Image) -> tuple[Mask, Mask]:
     """(rows, cols) bool each: where a line is seen, and its centreline."""
     reach = skel.parts_touching(probability >= LEVELS[0], probability >= LEVELS[1])
     return reach, skel.prune(skel.skeletonize(reach), probability, SPUR_PX, 0.0)

@@ -4,10 +4,9 @@ The network sees the picture at a fixed number of pixels, flattened twice and sc
 ridge response of the classical method: three channels that look much alike in generated and real
 pictures, whatever the display did to the grey values. It is told no pixel size: that is often
 unknown or wrong, so the scale has to be found in the picture. It answers how probably a pixel is
-vessel, how probably catheter, lead or wire, and how long the chord through vessel is there, in
-pixel edges: a vessel's width is in the picture, and a round vessel is as deep as it is wide. What
-is catheter, lead or wire a second network says, at half the resolution and within the same file:
-it is given the picture and the answers of the first.
+vessel, and how long the chord through vessel is there, in pixel edges: a vessel's width is in the
+picture, and a round vessel is as deep as it is wide. Which of the lines are catheters, leads or
+wires a second network within the same file says (``line_strips``).
 """
 
 from __future__ import annotations
@@ -23,9 +22,10 @@ from gcar_deploy.config import SEGMENTERS
 from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging import enhance
+from gcar_deploy.imaging.line_strips import NEAR, POINT, LinePoints
 from gcar_deploy.imaging.segment import resize
 from gcar_deploy.models import Kind, Session, read_model
-from gcar_deploy.types import Array, Image, Mask
+from gcar_deploy.types import Array, Image, Mask, Scalars
 
 #: sides of the network's input are multiples of this
 STRIDE = 16
@@ -35,11 +35,11 @@ SIDE, FINEST_SIDE = 352, 448
 #: of the longer side
 _LONGEST = 1024
 #: what the spec of a fitting model says of its input
-INPUT = {"channels": 3, "stride": STRIDE, "side": SIDE}
+INPUT = {"channels": 3, "stride": STRIDE, "side": SIDE, "point": POINT, "near": NEAR}
 KIND = Kind("segmenter", "segmenter", INPUT)
 #: finding where ``auto`` has no network
 MISSING = f"{KIND.shipped}.onnx is not installed: vessels were found by the classical method alone"
-OUTPUTS = ("probability", "chord", "device")
+INPUTS, OUTPUTS = ("channels", "points", "near"), ("probability", "chord", "device")
 #: the second flattening is this much wider than the first: borders of lung and heart stay
 _WIDER = 4.0
 #: the filters take a pixel of the network for so much: most fields are near 352 times it
@@ -104,17 +104,26 @@ class Seen:
     ----------
     probability : (rows, cols) float32, 0 .. 1, that the pixel is coronary vessel
     chord : (rows, cols) float32, >= 0, through vessel along the pixel's ray, pixel edges
-    device : (rows, cols) float32, 0 .. 1, that the pixel is catheter, lead or wire
     """
 
     probability: Image
     chord: Image
-    device: Image
+
+
+#: both networks of the file want all inputs: the least that the other one takes
+_NO_LINES: dict[str, Array] = {
+    "points": np.zeros((2, POINT), np.float32), "near": np.zeros((2, NEAR), np.int64),
+}  # fmt: skip
+_NO_PICTURE: dict[str, Array] = {
+    "channels": np.zeros((1, INPUT["channels"], 2 * STRIDE, 2 * STRIDE), np.float32),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Segmenter:
-    """The segmentation network; safe to share between threads.
+    """Two networks in one file: one sees vessels in a picture, the other devices along its lines.
+
+    Safe to share between threads.
 
     Attributes
     ----------
@@ -130,16 +139,11 @@ class Segmenter:
         return dataclasses.replace(self, should_stop=should_stop)
 
     def look(self, channels: Array) -> Seen:
-        """Return what the network sees in a picture; see ``answers``."""
-        return Seen(*self.answers(channels))
-
-    def answers(self, channels: Array, wanted: Sequence[str] = OUTPUTS) -> list[Image]:
-        """Return some of ``OUTPUTS``, each (rows, cols) float32.
+        """Return what the network sees in a picture.
 
         Parameters
         ----------
         channels : (3, rows, cols) float32, from ``net_input``
-        wanted : their names; what is not asked for is not worked out
 
         Raises
         ------
@@ -152,11 +156,25 @@ class Segmenter:
             [cv2.copyMakeBorder(c, 0, down, 0, right, cv2.BORDER_REPLICATE) for c in channels]
         )
         shape = (1, 1, rows + down, cols + right)
-        maps = self.session.run(
-            {"channels": padded[None]}, [shape] * len(wanted),
-            outputs=wanted, should_stop=self.should_stop,
-        )  # fmt: skip
-        return [np.ascontiguousarray(m[0, 0, :rows, :cols], np.float32) for m in maps]
+        maps = self._run(OUTPUTS[:2], [shape] * 2, _NO_LINES | {"channels": padded[None]})
+        return Seen(*(np.ascontiguousarray(m[0, 0, :rows, :cols], np.float32) for m in maps))
+
+    def devices(self, lines: LinePoints) -> Scalars:
+        """(n,) float32, 0 .. 1, that a point of a line is of a device: of no vessel.
+
+        Raises
+        ------
+        ModelError, NumericalError, CancelledError
+            As ``models.Session.run``.
+        """
+        feed = _NO_PICTURE | {"points": lines.points, "near": lines.near}
+        (found,) = self._run(OUTPUTS[2:], [(len(lines.points),)], feed)
+        return np.asarray(found, np.float32)
+
+    def _run(
+        self, wanted: Sequence[str], shapes: list[tuple[int, ...]], feed: dict[str, Array]
+    ) -> list[Array]:
+        return self.session.run(feed, shapes, outputs=wanted, should_stop=self.should_stop)
 
 
 def open_segmenter(path: Path, *, threads: int = 2) -> Segmenter:
@@ -168,7 +186,7 @@ def open_segmenter(path: Path, *, threads: int = 2) -> Segmenter:
         As ``models.read_model`` and ``models.Session``.
     """
     model = read_model(path, (KIND,))
-    return Segmenter(Session(model, ["channels"], threads=threads, arena=False))
+    return Segmenter(Session(model, INPUTS, threads=threads, arena=False))
 
 
 def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:

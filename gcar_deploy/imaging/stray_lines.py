@@ -67,7 +67,7 @@ def likely_devices(view: VesselImage, level: float) -> Iterator[Mask]:
         return
     rows, columns = view.mask.shape
     finer = 1 / network_scale(rows, columns, SIDE)
-    yield from device_parts(view.skeleton, view.device, None, level, finer)
+    yield from device_parts(view.skeleton, view.device, level, finer)
 
 
 def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:

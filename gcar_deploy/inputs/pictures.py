@@ -159,12 +159,12 @@ def _by_scene(
             angiograms.append(picture)
         elif isinstance(picture, (str, Path)) and is_dicom(picture):
             run = read_run(picture, options.dicom, chosen.get(number, runs.wanted[number]))
-            carm = _matched(view, run.pixels.shape, options.imaging, notes)
+            carm = _matched(view, run.pixels.shape, options.imaging, notes, picture)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
             notes += [f"view {view.id}: {note}" for note in run.notes]
         elif number in runs.cines:
             *read, frame = runs.frame(number, chosen)
-            made = _as_angiogram(read, view, options.imaging, notes)
+            made = _as_angiogram(read, view, options.imaging, notes, picture)
             angiograms.append(dataclasses.replace(made, frame=frame))
             if frame is not None:
                 notes.append(f"view {view.id}: frame {frame.number} of {frame.of}: {frame.reason}")
@@ -181,16 +181,16 @@ def _angiogram(
         read = _from_array(view.id, picture, options.limits)
     else:
         read = read_picture(picture, options.limits)
-    return _as_angiogram(read, view, options, notes)
+    return _as_angiogram(read, view, options, notes, picture)
 
 
 def _as_angiogram(
-    read: Sequence[Any], view: View, options: ImagingOptions, notes: list[str]
+    read: Sequence[Any], view: View, options: ImagingOptions, notes: list[str], source: object
 ) -> Angiogram:
-    """Pair pixels, bit depth and SHA-256 with their view."""
+    """Pair pixels, bit depth and SHA-256 with their view; ``source`` is where they are from."""
     pixels, depth, sha256 = read
     return Angiogram(
-        view_id=view.id, carm=_matched(view, pixels.shape, options, notes), pixels=pixels,
+        view_id=view.id, carm=_matched(view, pixels.shape, options, notes, source), pixels=pixels,
         bit_depth=depth, intensity=view.intensity, sha256=sha256,
     )  # fmt: skip
 
@@ -212,14 +212,17 @@ def _from_headers(
     return angiograms, scene.volume_grid(), notes
 
 
-def _matched(view: View, shape: tuple[int, ...], options: ImagingOptions, notes: list[str]) -> CArm:
+def _matched(
+    view: View, shape: tuple[int, ...], options: ImagingOptions, notes: list[str], source: object
+) -> CArm:
     """Fit a view to the size of its picture; what was rescaled is added to ``notes``."""
     try:
         carm, note = match_picture(
             view.carm, shape[0], shape[1], allow_rescale=options.allow_rescale
         )
     except GeometryError as error:
-        raise GeometryError(f"view {view.id}: {error}") from None
+        file = f"{Path(source).name}, " if isinstance(source, (str, Path)) else ""
+        raise GeometryError(f"{file}view {view.id}: {error}") from None
     if note:
         notes.append(f"view {view.id}: {note}")
     return carm

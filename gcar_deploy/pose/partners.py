@@ -20,9 +20,8 @@ from gcar_deploy.pose.pairwise import Pose
 #: each line that is left out lowers the disagreement to this share at least
 GAIN = 0.85
 #: a line from outside that is so probably a device, or a stretch of the tree that is so, goes
-#: where the views agree a little better without it; at 0.3, 0.8 and 1 vessels of pictures that
-#: show no device go, too
-LIKELY, INSIDE, LIKELY_GAIN = 0.5, 0.9, 0.95
+#: where the views agree a little better without it
+LIKELY, INSIDE, LIKELY_GAIN = 0.5, 0.5, 0.95
 #: at least this share of a view's line stays
 KEPT_SHARE = 0.5
 #: of a view's lines the longest are asked

@@ -192,7 +192,11 @@ def test_rescaled_pictures_are_taken_where_that_is_allowed_and_said(good_case, t
     looked = ("validate", case / "view1.png", case / "view2.png", "--geom", case / "geom.json")
     for call in (run_arguments(case, tmp_path / "out"), looked):
         done = gcar(*call)
-        assert done.code == 4 and "view 1: rows" in done.err and "--allow-rescale" in done.err
+        assert (
+            done.code == 4
+            and "view1.png, view 1: rows" in done.err
+            and "--allow-rescale" in done.err
+        )
     assert not (tmp_path / "out").exists()
     done = gcar(*run_arguments(case, tmp_path / "out", "--allow-rescale"))
     assert done.code == 0 and "0.8 times" in done.err

@@ -11,16 +11,19 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the export extra")
 
 from gcar_deploy.errors import ModelError, UsageError  # noqa: E402
-from gcar_deploy.imaging.net import KIND, SIDE, load_segmenter, open_segmenter  # noqa: E402
+from gcar_deploy.imaging.line_strips import POINT, LinePoints, near_points  # noqa: E402
+from gcar_deploy.imaging.net import KIND, load_segmenter, open_segmenter  # noqa: E402
 from gcar_export.scenes.cine import cine_pair  # noqa: E402
 from gcar_export.scenes.device_pictures import (  # noqa: E402
+    DEVICE,
+    NO_VESSEL,
+    NOT_ASKED,
+    OTHER,
     VESSEL,
-    DevicePicture,
-    cropped,
     device_picture,
     generator,
+    labels,
     pooled_device_picture,
-    turned,
 )
 from gcar_export.scenes.drawn_devices import drawn_devices  # noqa: E402
 from gcar_export.scenes.expert_pictures import expert_pictures  # noqa: E402
@@ -30,13 +33,13 @@ from gcar_export.shipping.export_segmenter import (  # noqa: E402
 )
 from gcar_export.training.devices import (  # noqa: E402
     TINY,
-    asked_at_half,
     chosen,
-    device_loss,
+    points_loss,
     train,
+    varied,
 )
-from gcar_export.training.networks.device_unet import DeviceUNet  # noqa: E402
-from gcar_export.training.segmenter_start import devices_of, frozen_segmenter  # noqa: E402
+from gcar_export.training.networks.line_net import LineNet, no_vessel  # noqa: E402
+from gcar_export.training.segmenter_start import devices_of, vessels_sha256  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -86,62 +89,85 @@ def test_a_runs_devices_are_seen_in_its_pictures_and_are_no_vessel():
 
 @pytest.mark.slow
 def test_what_is_asked_of_each_kind_of_picture(segmenter, real):
-    for index in range(6):
+    seen = set()
+    for index in range(8):
         made = device_picture(3, index, segmenter, real)
         again = device_picture(3, index, segmenter, real)
-        np.testing.assert_array_equal(made.channels, again.channels)
-        assert made.channels.shape == (6, SIDE, SIDE) and np.isfinite(made.channels).all()
-        weight = made.weight.astype(np.float32)
-        assert weight.max() <= VESSEL and not (made.device & (weight == VESSEL)).any()
-        if index % 3 == 2:  # of a real picture's ground nobody says anything
-            ground = ~made.device & (weight < 1)
-            assert not weight[ground & (cv2.dilate(weight, np.ones((5, 5))) < 0.1)].any()
-            assert (weight == VESSEL).any()
+        np.testing.assert_array_equal(made.lines.points, again.lines.points)
+        assert made.lines.points.shape == (len(made.label), POINT)
+        assert np.isfinite(made.lines.points).all()
+        known = set(made.label.tolist())
+        # Of a real picture's ground nobody says what it is.
+        assert not known & ({OTHER} if index % 4 == 2 else {NO_VESSEL})
+        seen |= known
+    assert {VESSEL, DEVICE} <= seen
+
+
+def test_what_a_line_is_where_vessels_and_devices_meet():
+    vessel, device = np.zeros((2, 40, 40), bool)
+    vessel[18:22], device[:, 8:12] = True, True
+    device &= ~vessel
+    told = labels(vessel, device, expert=False)
+    assert (told[18:22] == VESSEL).all() and (told[17, 12:] == NOT_ASKED).all()
+    assert told[17, 9] == NOT_ASKED and (told[:15, 8:12] == DEVICE).all()
+    assert (told[:15, 20:] == OTHER).all()
+    assert (labels(vessel, device, expert=True)[:15, 20:] == NO_VESSEL).all()
 
 
 def test_a_pooled_picture_is_drawn_once(segmenter, tmp_path):
     stream = generator("0", ())
-    one, again = (pooled_device_picture(tmp_path, stream, 4, 1, segmenter, ()) for _ in range(2))
-    np.testing.assert_array_equal(one.channels, again.channels)
+    one, again = (pooled_device_picture(tmp_path, stream, 4, 3, segmenter, ()) for _ in range(2))
+    np.testing.assert_array_equal(one.lines.points, again.lines.points)
+    np.testing.assert_array_equal(one.label, again.label)
+    made = device_picture(4, 3, segmenter)
+    assert made.lines.lengths == one.lines.lengths
+    np.testing.assert_array_equal(made.lines.near, one.lines.near)
+    np.testing.assert_allclose(made.lines.points, one.lines.points, atol=4e-3)
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_turning_keeps_picture_and_truth_together():
-    ramp = np.arange(16.0).reshape(1, 4, 4).astype(np.float16)
-    given = DevicePicture(ramp, ramp[0] > 7, ramp[0])
-    for k in range(12):
-        found = turned(np.random.default_rng(k), given)
-        np.testing.assert_array_equal(found.channels[0] > 7, found.device)
-        np.testing.assert_array_equal(found.channels[0], found.weight)
-        np.testing.assert_array_equal(np.sort(found.weight.ravel()), ramp.ravel())
+def _lines(rng):
+    lengths = (5, 30, 12)
+    points = rng.normal(size=(sum(lengths), POINT)).astype(np.float32)
+    pixels = np.zeros((len(points), 2), int)
+    return LinePoints(pixels, points, near_points(lengths), lengths)
 
 
-def test_a_crop_keeps_picture_and_truth_together():
-    ramp = np.arange(64.0).reshape(1, 8, 8)
-    found = cropped(np.random.default_rng(0), DevicePicture(ramp, ramp[0] > 30, ramp[0]), 4)
-    assert found.device.shape == (4, 4)
-    np.testing.assert_array_equal(found.channels[0] > 30, found.device)
-    np.testing.assert_array_equal(found.channels[0], found.weight)
-
-
-def test_thin_lines_stay_lines_and_shared_pixels_are_not_asked():
-    device, weight = torch.zeros(1, 8, 8), torch.full((1, 8, 8), 0.2)
-    device[0, 3] = 1
-    weight[0, 3] = 1
-    weight[0, 2:4, :2] = torch.tensor([[VESSEL, VESSEL], [1.0, 1.0]])
-    truth, asked = asked_at_half(device, weight)
-    assert truth.shape == (1, 4, 4) and truth[0, 1].all() and not truth[0, 0].any()
-    assert asked[0, 1, 0] == 0 and asked[0, 1, 1] == 1 and asked[0, 0, 0] == pytest.approx(0.2)
+def test_varied_lines_keep_points_and_labels_together():
+    rng = np.random.default_rng(0)
+    lines = _lines(rng)
+    lines.points[:, -1] = np.arange(len(lines.points))  # a column that no variation changes
+    label = np.arange(len(lines.points))
+    found = [varied(np.random.default_rng(k), lines, label) for k in range(16)]
+    for points, own in found:
+        np.testing.assert_array_equal(points[:, -1], own)
+        assert sorted(own[:5]) == [0, 1, 2, 3, 4]
+    assert len({tuple(own) for _, own in found}) == 2
+    assert len({points.tobytes() for points, _ in found}) == 4
 
 
 def test_loss_is_least_at_the_truth():
-    truth = (torch.rand(2, 20, 20) > 0.8).float()
-    weight = torch.ones(2, 20, 20)
-    right = 30 * (truth - 0.5)
-    assert device_loss(right, truth, weight) < 0.05 < 1 < device_loss(-right, truth, weight)
-    weight[:, :10] = 0
-    other = torch.where(weight > 0, right, -right)
-    torch.testing.assert_close(device_loss(other, truth, weight), device_loss(right, truth, weight))
+    label = torch.tensor([VESSEL, DEVICE, OTHER, NOT_ASKED])
+    right = 30 * torch.eye(4)[:, :3]
+    assert points_loss(right, label) < 1e-3 < 1 < points_loss(right.roll(1, 0), label)
+    vague = torch.tensor([NO_VESSEL])
+    assert points_loss(right[1:2], vague) < 1e-3 and points_loss(right[2:3], vague) < 1e-3
+    assert points_loss(right[:1], vague) > 10
+
+
+def test_a_point_is_seen_with_its_own_line_alone():
+    """A change on one line reaches another only by what all lines have in common."""
+    torch.manual_seed(0)
+    net = LineNet().eval()
+    for common in net.common:
+        torch.nn.init.zeros_(common.weight)
+    lines = _lines(np.random.default_rng(1))
+    points, near = torch.from_numpy(lines.points), torch.from_numpy(lines.near)
+    other = points.clone()
+    other[10] += 1
+    with torch.no_grad():
+        changed = (no_vessel(net(points, near)) - no_vessel(net(other, near))).abs() > 0
+    assert changed[5:35].all() and not changed[:5].any() and not changed[35:].any()
 
 
 def test_options():
@@ -165,20 +191,20 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     assert export_segmenter(KIND.path, out, 2, checkpoint) < 1e-4
     spec = json.loads(out.with_suffix(".json").read_text())
     assert spec["training"]["devices"]["step"] == 3
-    channels = device_picture(3, 1, segmenter).channels[:3].astype(np.float32)
-    before, after = segmenter.look(channels), open_segmenter(out, threads=1).look(channels)
+    channels = np.random.default_rng(0).normal(size=(3, 96, 112)).astype(np.float32)
+    lines = _lines(np.random.default_rng(2))
+    new = open_segmenter(out, threads=1)
+    before, after = segmenter.look(channels), new.look(channels)
     np.testing.assert_array_equal(before.probability, after.probability)
     np.testing.assert_array_equal(before.chord, after.chord)
-    # The next training stands on the same answers, the segmenter's own word on devices included.
-    first, second = (frozen_segmenter(path).look(channels) for path in (KIND.path, out))
-    np.testing.assert_array_equal(first.device, second.device)
-    np.testing.assert_allclose(first.probability, before.probability, atol=1e-4)
-    assert (before.device != after.device).any()
+    assert (segmenter.devices(lines) != new.devices(lines)).any()
+    # The next training stands on the same answers.
+    assert vessels_sha256(KIND.path) == vessels_sha256(out)
     # Both networks of a model go into another one.
     again = tmp_path / "again.onnx"
     export_segmenter(out, again, 1, out)
-    same = open_segmenter(again, threads=1).look(channels)
-    np.testing.assert_allclose(same.device, after.device, atol=1e-5)
+    same = open_segmenter(again, threads=1)
+    np.testing.assert_allclose(same.devices(lines), new.devices(lines), atol=1e-5)
     assert json.loads(again.with_suffix(".json").read_text())["training"] == spec["training"]
 
 
@@ -192,9 +218,9 @@ def test_a_training_goes_on_from_a_model(tmp_path):
         assert torch.allclose(value, shipped[name], atol=1e-7), name
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["warm_start"] == hashlib.sha256(KIND.path.read_bytes()).hexdigest()
-    with pytest.raises(ModelError, match=r"gcp-multi\.onnx holds no device network"):
-        devices_of(DeviceUNet(), KIND.path.with_name("gcp-multi.onnx"))
+    with pytest.raises(ModelError, match=r"gcp-multi\.onnx holds no network of lines"):
+        devices_of(LineNet(), KIND.path.with_name("gcp-multi.onnx"))
 
 
 def test_size_of_the_network():
-    assert 200_000 < sum(p.numel() for p in DeviceUNet().parameters()) < 500_000
+    assert 100_000 < sum(p.numel() for p in LineNet().parameters()) < 300_000

@@ -13,9 +13,8 @@ from scipy.interpolate import CubicSpline
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging import catheter, segment
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.imaging.learned import devices
+from gcar_deploy.imaging.learned import devices, vessel_lines
 from gcar_deploy.imaging.linegraph import LineGraph
-from gcar_deploy.imaging.net import Seen
 from gcar_deploy.imaging.pictures import vessel_pictures
 from gcar_deploy.imaging.resample import resized
 from gcar_deploy.imaging.shaft import shaft
@@ -107,41 +106,38 @@ def test_a_vessel_that_leaves_the_field_stays(name, seed):
     np.testing.assert_array_equal(found.mask, kept.mask)
 
 
-def _seen(tubes, device):
-    """What a network would say of tubes of which it takes those of ``device`` for no vessel."""
+def _told(tubes, device):
+    """What a network would say of tubes all of which it sees: those of ``device`` are no vessel."""
     path = _tubes(tubes)
+    reach, line = vessel_lines(np.where(path > 0.4, np.float32(0.97), np.float32(0.02)))
     other = (_tubes([device]) > 0.4) if device else np.zeros(path.shape, bool)
-    said = np.where(path > 0.4, np.float32(0.97), np.float32(0.02))
-    return Seen(np.where(other, np.float32(0.1), said), path, np.where(other, said, np.float32(0)))
+    return np.where(other & reach, np.float32(0.97), np.float32(0)), reach, line
 
 
-def test_what_the_network_calls_a_device_goes_from_the_border_on():
+def _gone(tubes, device):
+    picture = -np.log(raw_picture(_tubes(tubes)))
+    return devices(*_told(tubes, device), picture, np.zeros(picture.shape, bool))
+
+
+def test_what_the_network_calls_a_device_goes_and_what_it_feeds_stays():
     (above, shaft, *_), radius, _ = _CATHETERS["from above"]
     tubes, part = (*_TREE, _CATHETERS["from above"]), ([above, shaft], radius, radius)
-    picture = -np.log(raw_picture(_tubes(tubes)))
-    none = np.zeros(picture.shape, bool)
-    gone = devices(_seen(tubes, part), picture, none)
+    gone = _gone(tubes, part)
     own = skeletonize(_tubes([part]) > 0)
     vessel = skeletonize(_tubes(_TREE) > 0)
-    row, column = np.indices(none.shape)
+    row, column = np.indices(gone.shape)
     away = np.hypot(column - 78, row - 70) * _MM > 5.0
     assert (gone & own).sum() > 0.85 * own.sum()
     assert not (gone & vessel & away).any()
 
 
 def test_the_whole_tree_is_no_device_whatever_the_network_says():
-    tube = _tubes([_MAIN]) > 0.4
-    picture = -np.log(raw_picture(_tubes([_MAIN])))
-    said = np.where(tube, np.float32(0.97), np.float32(0.02))
-    seen = Seen(said, _tubes([_MAIN]), said)
-    assert not (devices(seen, picture, np.zeros_like(tube)) & tube).any()
+    assert not (_gone([_MAIN], _MAIN) & (_tubes([_MAIN]) > 0.4)).any()
 
 
 @pytest.mark.parametrize("name", sorted(_LEAVING))
 def test_a_vessel_of_the_network_that_leaves_the_field_stays(name):
-    picture = -np.log(raw_picture(_tubes(_LEAVING[name])))
-    gone = devices(_seen(_LEAVING[name], None), picture, np.zeros(picture.shape, bool))
-    assert not gone.any()
+    assert not _gone(_LEAVING[name], None).any()
 
 
 def test_a_lead_across_the_field_goes():

@@ -1,72 +1,108 @@
-"""Which parts of a line the network's word makes a device, and which it does not."""
+"""Which parts of a line are a device by the network's word, and how its word reaches them."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
 from gcar_deploy.errors import ImageError
-from gcar_deploy.imaging.device_lines import device_parts
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.device_lines import device_map, device_parts
+from gcar_deploy.imaging.net import SIDE, Seen
 from gcar_deploy.imaging.stray_lines import likely_devices, without_line
-from tests.imaging.test_stray_lines import APART, CROSSING, MIDDLE, VESSEL, covers, view_of
+from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, covers, view_of
 
 LEVEL = 0.7
-
-
-def parts(view, *strokes, said=0.9, valid=None):
-    """Parts of the view's line where the network says ``said`` of the strokes."""
-    device = np.zeros(view.mask.shape, np.float32)
-    for stroke in strokes:
-        device[stroke] = said
-    return list(device_parts(view.skeleton, device, view.valid if valid is None else valid, LEVEL))
-
-
 #: what the network calls a device in these: the left of the line across
 LEFT = CROSSING[0], slice(0, MIDDLE - 8)
 
 
-def test_a_device_from_the_border_goes_and_what_it_feeds_stays():
+def parts(view, *strokes, said=0.9):
+    """Parts of the view's line where the network says ``said`` of the strokes."""
+    device = np.zeros(view.mask.shape, np.float32)
+    for stroke in strokes:
+        device[stroke] = said
+    return list(device_parts(view.skeleton, device, LEVEL))
+
+
+def test_a_device_goes_and_what_it_feeds_stays():
     view = view_of(CROSSING)
     (part,) = parts(view, LEFT)
     assert covers(part, LEFT) > 0.9 and not part[:, MIDDLE - 2 :].any()
     assert parts(view, LEFT, said=0.6) == []
 
 
-def test_a_side_branch_that_leaves_the_field_is_for_the_views_to_decide():
-    view = view_of(VESSEL, LEFT, (CROSSING[0], slice(LEFT[1].stop, MIDDLE)))
-    assert parts(view, LEFT) == []
+def test_what_is_less_sure_goes_with_what_is_sure():
+    view = view_of(CROSSING)
     device = np.zeros(view.mask.shape, np.float32)
-    device[LEFT] = 0.9
-    (part,) = device_parts(view.skeleton, device, None, LEVEL)
-    assert covers(part, LEFT) > 0.9 and not part[:, MIDDLE - 2 :].any()
+    device[LEFT], device[LEFT[0], :20] = 0.5, 0.9
+    (part,) = device_parts(view.skeleton, device, LEVEL)
+    assert covers(part, LEFT) > 0.9
+    device[LEFT[0], 40:50] = 0.3  # the surest part ends here
+    (part,) = device_parts(view.skeleton, device, LEVEL)
+    assert part[:, :38].any() and not part[:, 41:].any()
 
 
-def test_a_stretch_within_the_tree_stays_whatever_is_said_of_it():
-    view = view_of(CROSSING)
-    inside = CROSSING[0], slice(60, 140)
-    assert parts(view, inside) == []
-    (part,) = parts(view_of(VESSEL, APART), APART)  # it hangs on nothing
-    assert covers(part, APART) > 0.8
-
-
-def test_the_border_is_that_of_the_field():
-    view = view_of(CROSSING)
-    inside = CROSSING[0], slice(40, 120)
-    valid = view.valid.copy()
-    valid[:, :40] = False
-    view = dataclasses.replace(view, skeleton=view.skeleton & valid)
-    assert parts(view, inside) == []
-    (part,) = parts(view, inside, valid=valid)
-    assert covers(part, inside) > 0.8
-
-
-def test_a_speck_is_no_device_and_without_a_line_there_is_none():
-    view = view_of(CROSSING)
-    assert parts(view, (CROSSING[0], slice(0, 12))) == []
+def test_the_surest_part_comes_first_and_a_speck_is_none():
+    view = view_of(VESSEL, CROSSING)
+    first, second = parts(view, (CROSSING[0], slice(0, 30)), (LEFT[0], slice(60, MIDDLE - 8)))
+    assert first.sum() > second.sum()
+    assert parts(view, (CROSSING[0], slice(20, 24))) == []
     nothing = np.zeros_like(view.skeleton)
-    assert list(device_parts(nothing, np.ones(nothing.shape, np.float32), ~nothing, LEVEL)) == []
+    assert list(device_parts(nothing, np.ones(nothing.shape, np.float32), LEVEL)) == []
+
+
+class _LeftOf:
+    """In place of the network: what lies left of a column is a device; it keeps what it is told."""
+
+    def __init__(self, column: float) -> None:
+        self.column = column
+
+    def devices(self, lines):
+        self.lines = lines
+        return np.where(lines.pixels[:, 1] < self.column, 0.9, 0.1).astype(np.float32)
+
+
+@pytest.mark.parametrize("side", [SIDE, 448])
+def test_its_word_comes_back_to_where_the_line_is(side):
+    """Lines are looked at at one size, whatever that of the picture; chords go with it."""
+    mask = np.zeros((side, side), np.uint8)
+    cv2.line(mask, (20, side // 3), (side - 20, side // 2), 1, 7)
+    reach = mask > 0
+    line = skel.skeletonize(reach)
+    chord = np.where(reach, np.float32(7), np.float32(0))
+    seen = Seen(reach.astype(np.float32), chord)
+    net = _LeftOf(SIDE / 2)
+    told = device_map(net, np.zeros((3, side, side), np.float32), seen, line, reach, ~reach & reach)
+    left = np.indices(reach.shape)[1] < side / 2 - 3
+    right = np.indices(reach.shape)[1] > side / 2 + 3
+    assert (told[reach & left] > 0.8).all() and (told[reach & right] < 0.2).all()
+    assert not told[~reach].any()
+    scale = SIDE / side
+    assert sum(net.lines.lengths) == pytest.approx(line.sum() * scale, rel=0.1)
+    # log(1 + chord) in the middle of the line
+    middle = net.lines.points[:, 4 * 17 + 8]
+    assert np.median(middle) == pytest.approx(np.log1p(7 * scale), rel=0.05)
+
+
+def test_where_lines_cross_the_vessel_goes_on():
+    view = view_of(VESSEL, CROSSING)
+    reach, line = view.mask, view.skeleton
+    maps = np.zeros((3, *reach.shape), np.float32)
+
+    class ByRow:
+        def devices(self, lines):
+            scale = SIDE / np.sqrt(reach.size)
+            row = lines.pixels[:, 0] / scale
+            across = (row >= CROSSING[0].start - 2) & (row < CROSSING[0].stop + 2)
+            return np.where(across, 0.95, 0.05).astype(np.float32)
+
+    seen = Seen(reach.astype(np.float32), reach.astype(np.float32))
+    told = device_map(ByRow(), maps, seen, line, reach, ~reach & reach)
+    assert covers(told > 0.9, LEFT) > 0.8
 
 
 def test_the_word_goes_with_the_view():

@@ -27,7 +27,9 @@ def model(tmp_path, monkeypatch):
     shape = ["n", INPUT["channels"], "rows", "cols"]
     x = helper.make_tensor_value_info("channels", TensorProto.FLOAT, shape)
     y = helper.make_tensor_value_info("p", TensorProto.FLOAT, ["n", 1, "rows", "cols"])
-    graph = helper.make_graph(nodes, "g", [x], [y], [weight])
+    points = helper.make_tensor_value_info("points", TensorProto.FLOAT, ["k", INPUT["point"]])
+    near = helper.make_tensor_value_info("near", TensorProto.INT64, ["k", INPUT["near"]])
+    graph = helper.make_graph(nodes, "g", [x, points, near], [y], [weight])
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
     path = tmp_path / "segmenter.onnx"
     monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: path)
