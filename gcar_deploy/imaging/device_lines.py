@@ -41,7 +41,7 @@ def device_map(
     """
     shape = line.shape
     scale = SIDE / float(np.sqrt(line.size))
-    found = line_points(*_at_side(channels, seen, line, holes, scale))
+    found = line_points(*_at_side(channels, seen, line, _outside(holes), scale))
     if found is None:
         return np.zeros(shape, np.float32)
     said = segmenter.devices(found)
@@ -54,6 +54,13 @@ def device_map(
     of_label = np.zeros(int(label.max()) + 1, np.float32)
     of_label[label[away == 0]] = on_line[away == 0]
     return np.where(reach, of_label[label], np.float32(0))
+
+
+def _outside(holes: Mask) -> Mask:
+    """(rows, cols) bool: holes from the picture's border on; what was erased within is none."""
+    frame = np.ones_like(holes)
+    frame[1:-1, 1:-1] = False
+    return skel.parts_touching(holes, holes & frame)
 
 
 def _at_side(

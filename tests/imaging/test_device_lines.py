@@ -88,6 +88,24 @@ def test_its_word_comes_back_to_where_the_line_is(side):
     assert np.median(middle) == pytest.approx(np.log1p(7 * scale), rel=0.05)
 
 
+def test_what_was_erased_within_the_field_is_no_border():
+    """Beside what was erased a line does not come from outside; at the collimator it does."""
+    line = np.zeros((SIDE, SIDE), bool)
+    line[170, 120:230] = True
+    reach = cv2.dilate(line.astype(np.uint8), np.ones((5, 5))) > 0
+    seen = Seen(reach.astype(np.float32), np.where(reach, np.float32(5), np.float32(0)))
+    points = []
+    for erased in (None, (slice(160, 182), slice(90, 115)), (slice(0, 352), slice(0, 115))):
+        holes = np.zeros_like(line)
+        if erased is not None:
+            holes[erased] = True
+        net = _LeftOf(0)
+        device_map(net, np.zeros((3, SIDE, SIDE), np.float32), seen, line, reach, holes)
+        points.append(net.lines.points)
+    np.testing.assert_array_equal(points[0], points[1])
+    assert np.abs(points[0] - points[2]).max() > 0.5
+
+
 def test_where_lines_cross_the_vessel_goes_on():
     view = view_of(VESSEL, CROSSING)
     reach, line = view.mask, view.skeleton
