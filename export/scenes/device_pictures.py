@@ -121,7 +121,7 @@ def _looked_at(
     holes = cv2.morphologyEx(dark, cv2.MORPH_OPEN, _NEAR_VESSEL) > 0
     line = vessel_lines(np.where(holes, np.float32(0), seen.probability))[1]
     maps = np.concatenate([channels, seen.probability[None], seen.chord[None]])
-    lines = line_points(maps, line, holes) if line.any() else None
+    lines = line_points(maps, line, holes)
     if lines is None:
         return DevicePicture(no_lines(), np.zeros(0, np.int8))
     label = labels(truth[0] > 0.5, truth[3] > 0.5, expert)

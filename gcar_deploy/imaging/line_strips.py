@@ -68,6 +68,8 @@ def line_points(maps: Array, line: Mask, holes: Mask) -> LinePoints | None:
     line : (rows, cols) bool, one pixel wide
     holes : (rows, cols) bool, pixels without picture
     """
+    if not line.any():
+        return None
     around = _Around(maps, line, holes)
     found = [around.along(np.asarray(chain, float)) for chain in chains(line, 2.0 + around.width)
              if len(chain) >= SHORTEST_PX]  # fmt: skip
