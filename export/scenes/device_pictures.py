@@ -20,7 +20,7 @@ import numpy as np
 
 from gcar_deploy.imaging import learned, line_chains, line_strips
 from gcar_deploy.imaging.learned import vessel_lines
-from gcar_deploy.imaging.line_strips import POINT, LinePoints, line_points
+from gcar_deploy.imaging.line_strips import LinePoints, line_points
 from gcar_deploy.imaging.net import SIDE, Segmenter
 from gcar_deploy.types import Array, Mask
 from gcar_export.scenes import augmented, cine, drawn_devices, picture_pool
@@ -122,8 +122,6 @@ def _looked_at(
     line = vessel_lines(np.where(holes, np.float32(0), seen.probability))[1]
     maps = np.concatenate([channels, seen.probability[None], seen.chord[None]])
     lines = line_points(maps, line, holes)
-    if lines is None:
-        return DevicePicture(no_lines(), np.zeros(0, np.int8))
     label = labels(truth[0] > 0.5, truth[3] > 0.5, expert)
     return DevicePicture(lines, label[lines.pixels[:, 0], lines.pixels[:, 1]])
 
@@ -135,12 +133,6 @@ def labels(vessel: Mask, device: Mask, expert: bool) -> Array:
     out = np.where(on_device, DEVICE, NO_VESSEL if expert else OTHER)
     out = np.where(beside, NOT_ASKED, out)
     return np.where(vessel, VESSEL, out).astype(np.int8)
-
-
-def no_lines() -> LinePoints:
-    """Lines of a picture that has none."""
-    none = np.zeros((0, 2), np.int64)
-    return LinePoints(none, np.zeros((0, POINT), np.float32), none, ())
 
 
 def generator(segmenter: str, real: Sequence[ExpertPicture]) -> str:

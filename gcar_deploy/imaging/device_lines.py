@@ -42,7 +42,7 @@ def device_map(
     shape = line.shape
     scale = SIDE / float(np.sqrt(line.size))
     found = line_points(*_at_side(channels, seen, line, _outside(holes), scale))
-    if found is None:
+    if not len(found.pixels):
         return np.zeros(shape, np.float32)
     said = segmenter.devices(found)
     row, column = np.clip(np.rint(found.pixels / scale), 0, np.subtract(shape, 1)).astype(int).T

@@ -58,8 +58,8 @@ class LinePoints:
     lengths: tuple[int, ...]
 
 
-def line_points(maps: Array, line: Mask, holes: Mask) -> LinePoints | None:
-    """Look along the lines of a picture; None where no line has a course.
+def line_points(maps: Array, line: Mask, holes: Mask) -> LinePoints:
+    """Look along the lines of a picture; no points where no line has a course.
 
     Parameters
     ----------
@@ -68,13 +68,14 @@ def line_points(maps: Array, line: Mask, holes: Mask) -> LinePoints | None:
     line : (rows, cols) bool, one pixel wide
     holes : (rows, cols) bool, pixels without picture
     """
-    if not line.any():
-        return None
-    around = _Around(maps, line, holes)
-    found = [around.along(np.asarray(chain, float)) for chain in chains(line, 2.0 + around.width)
-             if len(chain) >= SHORTEST_PX]  # fmt: skip
+    found = []
+    if line.any():
+        around = _Around(maps, line, holes)
+        found = [around.along(np.asarray(chain, float)) for chain in
+                 chains(line, 2.0 + around.width) if len(chain) >= SHORTEST_PX]  # fmt: skip
     if not found:
-        return None
+        none = np.zeros((0, 2), np.int64)
+        return LinePoints(none, np.zeros((0, POINT), np.float32), near_points(()), ())
     pixels, points = (np.concatenate(parts) for parts in zip(*found, strict=True))
     lengths = tuple(len(one) for one, _ in found)
     return LinePoints(pixels, points, near_points(lengths), lengths)
