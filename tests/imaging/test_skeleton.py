@@ -3,7 +3,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gcar_deploy.imaging import skeleton as skel
@@ -18,17 +18,40 @@ def _strokes(points, width, size=80):
 _points = st.lists(st.tuples(st.integers(0, 79), st.integers(0, 79)), min_size=2, max_size=6)
 
 
+def _count(mask, connectivity):
+    return cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)[0]
+
+
+def _parts_and_holes(mask):
+    return _count(mask, 8), _count(np.pad(~mask, 1, constant_values=True), 4)
+
+
+def _needless_blocks(line):
+    """2x2 blocks one of whose pixels, no line's end, could go and change no part or hole."""
+    line = np.pad(line, 2)
+    whole = _parts_and_holes(line)
+    needless = 0
+    for y, x in np.argwhere(line[1:, 1:] & line[:-1, 1:] & line[1:, :-1] & line[:-1, :-1]):
+        for row, column in ((y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)):
+            without = line.copy()
+            without[row, column] = False
+            end = line[row - 1 : row + 2, column - 1 : column + 2].sum() <= 2
+            if not end and _parts_and_holes(without) == whole:
+                needless += 1
+                break
+    return needless
+
+
 @settings(max_examples=80, deadline=None)
 @given(_points, st.integers(1, 9))
+@example([(0, 53), (50, 67), (0, 55)], 1)  # a wedge that crosses itself three times
 def test_thin_subset_and_as_many_parts(points, width):
     mask = _strokes(points, width)
     line = skel.skeletonize(mask)
     assert not (line & ~mask).any()
-    parts = [cv2.connectedComponents(m.astype(np.uint8), connectivity=8)[0] for m in (mask, line)]
-    assert parts[0] == parts[1]
-    # one pixel wide: no 2x2 block but at crossings, where four lines may meet
-    blocks = line[1:, 1:] & line[:-1, 1:] & line[1:, :-1] & line[:-1, :-1]
-    assert blocks.sum() <= max(2, 0.02 * line.sum())
+    assert _parts_and_holes(mask) == _parts_and_holes(line)
+    # one pixel wide: lines that cross may need a block of four, hardly any other has one
+    assert _needless_blocks(line) <= max(4, 0.02 * line.sum())
 
 
 def test_one_pixel_vessel_and_stub_stay():
