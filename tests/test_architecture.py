@@ -231,6 +231,7 @@ def test_help_loads_nothing_heavy():
     assert not loaded_by(code) & set(HEAVY)
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-37")
 def test_a_run_of_pictures_loads_only_what_it_uses(tmp_path):
     """No DICOM, no library that reads other people's files, nothing for three views."""

@@ -52,6 +52,7 @@ def test_what_a_work_raises_comes_through(count):
             started(fails)()
 
 
+@pytest.mark.slow
 def test_a_reconstruction_is_the_same_on_one_thread_and_on_three():
     case = demo_case()
     one, three = (Engine(threads=n).reconstruct(case.pictures, case.geometry) for n in (1, 3))

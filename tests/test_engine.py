@@ -37,6 +37,7 @@ def content(result: Result) -> bytes:
     return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
 
 
+@pytest.mark.slow
 def test_arrays_with_a_scene_a_dict_or_a_file_give_one_result(case, engine, tmp_path):
     angiograms, grid, scene = case
     arrays = [a.pixels.astype(np.uint16) for a in angiograms]
@@ -59,6 +60,7 @@ def test_masks_alone_give_the_tree(case):
     assert off.mean() < 1.0 and missed.mean() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-36")
 def test_threads_share_one_engine_and_agree_to_the_byte(case, engine):
     angiograms, grid, _ = case
@@ -244,6 +246,7 @@ def _changed(angiograms, grid, change):
     return moved, dataclasses.replace(grid, center_mm=center), -shift
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-36")
 @pytest.mark.parametrize(
     "change", [(3e-7, -9e-7, 1e-6), (1.37, -2.21, 0.83), "order", "border"], ids=str

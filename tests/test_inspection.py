@@ -136,6 +136,7 @@ def three_raw_views_with_the_table_moved():
     return angiograms, Grid(center_mm=(0, 0, 0), size_mm=(130,) * 3, shape=(64,) * 3)
 
 
+@pytest.mark.slow
 def test_three_views_are_placed_as_run_places_them(monkeypatch):
     """Also by the tree that they show, and what is said of the correction is the same."""
     monkeypatch.setattr("gcar_deploy.pose.bundling.LEAST_PX", 0.0)

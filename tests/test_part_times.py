@@ -11,6 +11,7 @@ pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [(), pytest.param(("-n", "2"), marks=pytest.mark.slow)])
 def test_quick_tests_go_first_and_both_times_are_told(pytester, monkeypatch, workers):
     # Other plugins are not asked, and take a second each to load.

@@ -69,6 +69,7 @@ def views(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.png"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("predictor", ["none", "multi"])
 @pytest.mark.req("REQ-39")
 def test_nothing_of_the_patient_in_result_page_or_log(patient, tmp_path, predictor):

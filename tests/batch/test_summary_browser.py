@@ -48,6 +48,7 @@ def cases(page):
     return [cell.inner_text() for cell in page.locator("tbody tr:visible td.name").all()]
 
 
+@pytest.mark.slow
 def test_columns_sort_both_ways_by_number_and_by_word(browse):
     page = browse(1280)
     assert cases(page) == ["c10", "c9", LONG, "c1"]
@@ -61,6 +62,7 @@ def test_columns_sort_both_ways_by_number_and_by_word(browse):
     assert cases(page) == [LONG, "c1", "c9", "c10"]
 
 
+@pytest.mark.slow
 def test_statuses_are_filtered(browse):
     page = browse(1280)
     page.click("#filter button:has-text('ok')")

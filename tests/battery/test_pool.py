@@ -31,6 +31,7 @@ print(tally.cases, tally.outcomes["fine"])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="forks and POSIX limits")
 def test_what_goes_wrong_is_counted_and_the_rest_goes_on():
     done = subprocess.run(

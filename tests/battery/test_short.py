@@ -27,6 +27,7 @@ def battery(*arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "share", "module"),
     [
@@ -54,6 +55,7 @@ def test_damaged_command_lines_are_refused_in_one_line():
     assert "30 cases, 0 findings" in said
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_stopped(tmp_path):
     state = tmp_path / "state.json"
     first = battery("fuzz", "--kind", "json", "--share", 0.01, "--state", state)

@@ -57,6 +57,7 @@ def test_pose_off_estimates_nothing(good_case, tmp_path):
     assert view["disagreement_after"] == view["disagreement_before"]
 
 
+@pytest.mark.slow
 def test_a_mask_wins(good_case, tmp_path):
     """Half of view 1 masked away: what is left of the tree is what both then show."""
     pixels = cv2.imread(str(good_case / "view1.png"), cv2.IMREAD_UNCHANGED)

@@ -31,6 +31,7 @@ def result_of(folder):
     return found
 
 
+@pytest.mark.slow
 def test_a_printed_order_repeats_the_run(good_case, tmp_path):
     told = ("--landmark", "48,48:48,48", "--refiner", "none", "--pose", "auto", "--glb")
     asked = gcar(*arguments(good_case, tmp_path / "a", *told, "--print-order"))
@@ -121,6 +122,7 @@ def test_a_mask_of_the_fifth_view_is_read(good_case, tmp_path):
         assert checked.code == 3 and "mask 5" in checked.err
 
 
+@pytest.mark.slow
 def test_a_table_does_what_its_columns_say(good_case, tmp_path, monkeypatch):
     """Runs that want their pixel spacing, a mask for one case, another refiner for the next."""
     pytest.importorskip("pydicom")

@@ -70,6 +70,7 @@ def test_a_folder_that_is_none_is_refused(tmp_path):
     assert done.code == 2 and "not a folder" in done.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "library", "extra"),
     [

@@ -127,6 +127,7 @@ def test_json_is_one_object_that_is_the_result(good_case, tmp_path):
     assert printed == stored
 
 
+@pytest.mark.slow
 def test_json_of_a_refusal_is_one_object_too(good_case, tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     case = tmp_path / "case"
@@ -140,6 +141,7 @@ def test_json_of_a_refusal_is_one_object_too(good_case, tmp_path):
     jsonschema.validate(found, json.loads(schema))
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-27")
 def test_force_replaces_and_info_reads(good_case, tmp_path):
     out = tmp_path / "out"
@@ -160,6 +162,7 @@ def test_force_replaces_and_info_reads(good_case, tmp_path):
     assert done.code == 2 and "centerline.csv" in done.err
 
 
+@pytest.mark.slow
 def test_a_second_demo_takes_the_place_of_the_first_and_of_nothing_else(good_case, tmp_path):
     out = tmp_path / "gcar-demo"
     demo = ("demo", "--out", out, "--predictor", "none", "--refiner", "none", "--quiet")
@@ -241,6 +244,7 @@ def test_doctor_passes_its_self_test():
     assert all(one["sound"] and one["golden"] < 1e-3 for one in report["models"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gcp-multi", "gcp-paper", "segmenter"])
 @pytest.mark.parametrize("fault", ["missing", "altered"])
 def test_doctor_checks_every_shipped_model(name, fault, tmp_path, monkeypatch):
@@ -268,6 +272,7 @@ def test_doctor_checks_every_shipped_model(name, fault, tmp_path, monkeypatch):
     assert list(unsound) == [name] and words in unsound[name]
 
 
+@pytest.mark.slow
 def test_demo_ends_with_a_picture_and_the_time(tmp_path):
     done = gcar("demo", "--out", tmp_path / "demo")
     assert done.code == 0, done.err

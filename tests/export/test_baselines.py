@@ -67,6 +67,7 @@ def test_rtk_projects_as_the_ray_caster_does(tree):
         assert projected.sum() == pytest.approx(cast.sum(), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_volume_passes_through_rtk_unchanged(tree):
     pytest.importorskip("itk")
     from gcar_export.methods.rtk_geometry import volume_array, volume_image

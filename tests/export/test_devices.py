@@ -74,6 +74,7 @@ def test_devices_are_of_every_calibre_and_come_from_outside():
     assert min(widths) < 3 and max(widths) > 5 and at_border >= 20
 
 
+@pytest.mark.slow
 def test_a_runs_devices_are_seen_in_its_pictures_and_are_no_vessel():
     darker = []
     for number in range(4):
@@ -114,6 +115,7 @@ def test_what_a_line_is_where_vessels_and_devices_meet():
     assert (labels(vessel, device, expert=True)[:15, 20:] == NO_VESSEL).all()
 
 
+@pytest.mark.slow
 def test_a_pooled_picture_is_drawn_once(segmenter, tmp_path):
     stream = generator("0", ())
     one, again = (pooled_device_picture(tmp_path, stream, 4, 3, segmenter, ()) for _ in range(2))
@@ -208,6 +210,7 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     assert json.loads(again.with_suffix(".json").read_text())["training"] == spec["training"]
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_from_a_model(tmp_path):
     options = dataclasses.replace(TINY, steps=1, learning_rate=1e-9)
     train(tmp_path / "run", options, pool=tmp_path / "pool", begin_from=KIND.path)

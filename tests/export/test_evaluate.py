@@ -74,6 +74,7 @@ class PerfectEngine:
         )
 
 
+@pytest.mark.slow
 def test_cases_are_consistent(data):
     label = read_label(data / "imagecas" / "1.label.nii.gz")
     for protocol in PROTOCOLS:
@@ -90,6 +91,7 @@ def test_cases_are_consistent(data):
         make_case(label, "paper", views=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("protocol", "pitch", "side"), [
     ("common-lca", 0.65, 0), ("common-rca", 0.55, 1),
 ])  # fmt: skip
@@ -114,6 +116,7 @@ def test_the_common_protocol_shows_masks_of_one_artery_at_its_centroid(data, pro
         make_case(label, protocol, views=4)
 
 
+@pytest.mark.slow
 def test_the_common_protocol_is_measured_as_its_peers_are(data, tmp_path, monkeypatch):
     label = data / "imagecas" / "1.label.nii.gz"
     truth = make_case(read_label(label), "common-rca").truth.copy()
@@ -158,6 +161,7 @@ def test_case_folder_round_trip(data, tmp_path):
     assert np.allclose(truth.affine, case.grid.affine_ras())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefix", ["P", "C", "M"])
 def test_protocols_make_the_ready_cases(prefix):
     from gcar_deploy.geometry.scene import load_scene

@@ -210,6 +210,7 @@ def test_a_tree_that_did_not_come_out_is_no_loss():
     assert cost([refused], GATES) == 0.0
 
 
+@pytest.mark.slow
 def test_tables_and_picture(tmp_path):
     rows = [row(), row("swapped", other=0.05), row(dsc=None, refused="no vessel"), row("two trees")]
     text = status_table(rows, GATES)

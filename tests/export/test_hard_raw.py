@@ -6,6 +6,7 @@ import pytest
 from gcar_export.studies.hard_raw import raw_pair, table
 
 
+@pytest.mark.slow
 def test_a_pair_is_drawn_again_alike_and_shows_its_tree():
     one, again, other = raw_pair(5, 0), raw_pair(5, 0), raw_pair(5, 2)
     for a, b in zip(one.angiograms, again.angiograms, strict=True):

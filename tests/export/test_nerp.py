@@ -12,6 +12,7 @@ from tests.export.test_baselines import GRID, carm, pictures, tree  # noqa: F401
 SMALL = NerpOptions(features=32, width=32, hidden_layers=2, steps=120, bandwidth=5.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", [carm(-30, -20), carm(45, 25, detector_rotation_deg=15)])
 def test_rays_through_voxels_agree_with_the_ray_caster(tree, view):  # noqa: F811
     voxels = np.argwhere(tree.occupancy > 0)

@@ -116,6 +116,7 @@ def test_empty_and_unseen_volumes_are_dark():
     assert not raycast(away, carm(0, 0)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", ["0001", *(pytest.param(c, marks=pytest.mark.slow) for c in ("0401", "0595"))]
 )

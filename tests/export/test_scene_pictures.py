@@ -131,6 +131,7 @@ def test_oval_lumens_keep_their_area_and_their_line():
         np.testing.assert_allclose(radius[truth > 0], 1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(PATH_ERRORS))
 def test_every_kind_of_input_can_be_asked_for(kind):
     inputs = tuple(float(k == kind) for k in PATH_ERRORS)

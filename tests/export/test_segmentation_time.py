@@ -15,6 +15,7 @@ def test_the_ratio_is_that_to_the_pair_and_goes_without_it():
     assert alone[0].count("|") == 3 and "itk" not in "".join(alone) and "0.300" in alone[2]
 
 
+@pytest.mark.slow
 def test_every_method_reads_every_picture_and_the_pair_runs_beside(monkeypatch):
     read, paired = [], []
     monkeypatch.setattr(

@@ -231,6 +231,7 @@ def test_the_networks_size_is_that_of_the_picture_not_of_its_pixels():
     assert at_network_size(long, long > 0)[0].shape == (16, 1024)
 
 
+@pytest.mark.slow
 def test_lines_are_looked_at_at_the_size_they_were_learned_at():
     asked = []
 
@@ -265,6 +266,7 @@ def drawn(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_folds_leave_each_picture_out_once(drawn):
     pictures = expert_pictures(drawn)
     assert [p.name for p in pictures] == [str(k) for k in range(1, 11)]

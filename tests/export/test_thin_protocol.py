@@ -30,6 +30,7 @@ def test_pictures_show_the_line_with_the_noise_that_is_named() -> None:
     assert case.truth[case.truth > 0].sum() > 500
 
 
+@pytest.mark.slow
 def test_the_same_tree_at_every_noise_and_others_by_name() -> None:
     lines = [thin_case("02", protocol).line_mm for protocol in THIN]
     assert all(line is not None and np.array_equal(line, lines[0]) for line in lines)

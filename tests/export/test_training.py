@@ -186,6 +186,7 @@ def test_a_step_in_bfloat16_stays_near_one_in_float32(tmp_path):
             torch.testing.assert_close(a[key], b[key], atol=2 * one.learning_rate, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_a_training_may_begin_from_a_model(tmp_path):
     shipped = shipped_model_path("gcp-multi")
     train(tmp_path, PRESETS["tiny"], CONFIGS["cpu"], until=0.0, warm_start=shipped)

@@ -52,6 +52,7 @@ def lengths_and_radii(seed, draw):
     return np.linalg.norm(ends - starts, axis=1), radii
 
 
+@pytest.mark.slow
 def test_thin_trees_reach_a_quarter_of_a_millimetre_and_keep_their_trunks():
     thin = [lengths_and_radii(seed, thin_style) for seed in range(20)]
     share = [length[radii < 0.5].sum() / length.sum() for length, radii in thin]

@@ -131,6 +131,7 @@ def test_frames_that_are_asked_for_are_taken_as_they_are(made, case):
         prepare(views, case / "geom.json", options)
 
 
+@pytest.mark.slow
 def test_the_verb_tells_the_pair_with_a_picture(made, case, tmp_path):
     told = gcar("frames", case / "run1.tif", case / "run2", "--geom", case / "geom.json",
                 "--out", tmp_path / "pairs", "--json")  # fmt: skip

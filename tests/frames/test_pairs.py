@@ -121,12 +121,14 @@ def test_runs_at_rest_choose_no_pair():
     assert choose_frames(runs, {1: None, 2: None}) == {}
 
 
+@pytest.mark.slow
 def test_a_generated_patient_within_a_frame():
     row = judged(cine_pair(CHOSEN_ON, 3))
     assert row.error_frames <= 1.0
     assert row.margin is not None and row.margin > 0.03
 
 
+@pytest.mark.slow
 def test_a_third_run_follows_the_first():
     made = cine_pair(CHOSEN_ON, 3)
     first, second = (seen_run(run) for run in made.runs)

@@ -30,6 +30,7 @@ def test_what_is_not_there_is_said(name, device, words):
         backend_named(name, device)
 
 
+@pytest.mark.slow
 def test_compiled_loops_are_the_same_sums():
     """The same windows, so rounding alone: also behind the source, off the picture, unturned."""
     pytest.importorskip("numba")

@@ -110,6 +110,7 @@ def test_only_motion_across_the_planes_shows():
     assert min(values) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 2.0, -3.5])
 def test_uncovered_length_is_twice_the_motion_of_one_bar_whatever_stands_behind_it(shift):
     """Of a bar moved along itself each end leaves ``shift`` mm that one view alone covers."""

@@ -279,6 +279,7 @@ def agree(validator, data):
         validator.validate(data)
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-04")
 def test_schema_file_says_the_same():
     validator = schema_validator()

@@ -83,6 +83,7 @@ def _dice(a, b):
     return 2 * (a & b).sum() / (a.sum() + b.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", sorted(_CATHETERS))
 def test_a_catheter_goes_and_the_vessels_stay(name, seed):
@@ -98,6 +99,7 @@ def test_a_catheter_goes_and_the_vessels_stay(name, seed):
     assert _dice(found.mask, clean.mask) > 0.94
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", sorted(_LEAVING))
 def test_a_vessel_that_leaves_the_field_stays(name, seed):

@@ -32,6 +32,7 @@ def test_four_pictures_at_the_size_of_the_first(tmp_path, picture):
     assert [p.name for p in out.parent.iterdir()] == ["steps"]
 
 
+@pytest.mark.slow
 def test_existing_folder_needs_force(tmp_path, picture):
     out = tmp_path / "steps"
     out.mkdir()

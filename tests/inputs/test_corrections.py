@@ -58,6 +58,7 @@ def again(engine, order, **change):
     return engine.reconstruct_order(parse_order(dataclasses.replace(order, **change).to_dict()))
 
 
+@pytest.mark.slow
 def test_a_deleted_branch_is_gone_and_the_rest_stays(engine, order, plain):
     gone = plain.tree.branches[4]
     place = tuple(round(float(x), 1) for x in gone.points_mm[len(gone) // 2])
@@ -69,6 +70,7 @@ def test_a_deleted_branch_is_gone_and_the_rest_stays(engine, order, plain):
     assert not any("deleted_mm 1" in text for text in found.quality.findings)
 
 
+@pytest.mark.slow
 def test_a_second_deletion_sees_the_tree_that_the_first_left(engine, order, plain):
     """Two branches that met at the fork of a deleted third are one, and go as one."""
     tree = plain.tree
@@ -81,6 +83,7 @@ def test_a_second_deletion_sees_the_tree_that_the_first_left(engine, order, plai
     assert b.tree.length_mm == pytest.approx(a.tree.length_mm - second.length_mm, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_marked_ostium_is_where_the_tree_begins(engine, order, plain):
     tip = plain.tree.branches[-1].points_mm[-1]
     marks = tuple(tuple(view.carm.project(tip[None])[0][0].tolist()) for view in plain.views)

@@ -89,6 +89,7 @@ def test_json_and_back(order):
     assert order.with_files(lambda _, path: path) == order
 
 
+@pytest.mark.slow
 @settings(suppress_health_check=[HealthCheck.too_slow])
 @given(orders())
 def test_every_order_makes_options_that_pass_their_checks(order):

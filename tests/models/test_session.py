@@ -47,6 +47,7 @@ def raw():
     return raw_pair()
 
 
+@pytest.mark.slow
 def test_a_raw_pair_names_the_network_that_found_its_vessels(raw):
     summary = Engine(options=HULL, threads=1).reconstruct(*raw).summary()
     assert summary["segmenter"]["name"] == "segmenter"
@@ -54,6 +55,7 @@ def test_a_raw_pair_names_the_network_that_found_its_vessels(raw):
     assert f"{summary['segmenter']['sha256']}  segmenter.onnx" in manifest.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["path lengths", "masks", "classic", "even ground"])
 def test_where_no_network_was_asked_none_is_named(case, raw):
     angiograms, grid = tiny_case()[:2] if case == "path lengths" else raw
@@ -76,6 +78,7 @@ def test_where_no_network_was_asked_none_is_named(case, raw):
     assert MISSING not in result.quality.findings
 
 
+@pytest.mark.slow
 def test_a_missing_network_is_never_silent(raw, monkeypatch):
     there = shipped_model_path
     monkeypatch.setattr(
@@ -123,6 +126,7 @@ def test_a_running_segmenter_is_cancelled(raw, monkeypatch):
     assert not any(t.name == "gcar-watch" for t in threading.enumerate())
 
 
+@pytest.mark.slow
 def test_the_deadline_reaches_a_running_segmenter(raw, monkeypatch):
     engine = Engine(options=HULL, threads=1)
     engine.reconstruct(*raw)

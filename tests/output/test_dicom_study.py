@@ -47,6 +47,7 @@ def archive(result, jane, tmp_path_factory):
     return room / "out"
 
 
+@pytest.mark.slow
 def test_every_object_belongs_to_the_study_and_names_its_patient(archive, jane):
     run = pydicom.dcmread(jane[0])
     found = {path.name: pydicom.dcmread(path) for path in archive.glob("*.dcm")}

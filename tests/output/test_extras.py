@@ -85,6 +85,7 @@ def test_extras_repeat_to_the_byte_and_are_listed(with_extras, result):
         assert name in json.loads(with_extras["result.json"])["files"]
 
 
+@pytest.mark.slow
 def test_unknown_extras_and_missing_libraries_are_told_before_any_work(result):
     with pytest.raises(UsageError, match="'step' is none of glb, dicom-stl"):
         render_files(result, ("step",))

@@ -40,6 +40,7 @@ def test_manifest_lists_every_other_file_with_its_hash(folder):
         assert hashlib.sha256(data).hexdigest() == entry["sha256"]
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-26")
 def test_result_json_is_strict_and_follows_its_schema(folder):
     jsonschema = pytest.importorskip("jsonschema")
@@ -143,6 +144,7 @@ def test_ply_by_plyfile(result):
     assert np.all((red > 0) & (red < 1))
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-32")
 def test_centreline_by_vtk(result, folder):
     vtk = pytest.importorskip("vtk")
@@ -172,6 +174,7 @@ def test_centreline_by_vtk(result, folder):
         start += len(branch)
 
 
+@pytest.mark.slow
 def test_an_empty_tree_is_a_valid_file(result, tmp_path):
     vtk = pytest.importorskip("vtk")
     from gcar_deploy.tree.tree import empty_tree

@@ -160,6 +160,7 @@ def crossings(surface: Surface) -> int:
     return int(hits.sum())
 
 
+@pytest.mark.slow
 def test_no_triangle_runs_through_another(made):
     from gcar_deploy.output.handover import artery_surface
 
@@ -172,6 +173,7 @@ def test_no_triangle_runs_through_another(made):
     assert crossings(Surface(vertices_mm=bent, faces=surface.faces)) > 0
 
 
+@pytest.mark.slow
 def test_a_whole_tree_has_a_cap_at_every_end():
     tree = from_inlets(left_tree())
     drop = drop_of(tree)
@@ -183,6 +185,7 @@ def test_a_whole_tree_has_a_cap_at_every_end():
     assert len(found) >= len(tree.branches)
 
 
+@pytest.mark.slow
 def test_an_end_inside_another_vessel_stays_round_and_that_is_said():
     import dataclasses
 

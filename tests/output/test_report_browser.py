@@ -59,10 +59,12 @@ def colors(page, selector):
     return {tuple(map(int, c.split(","))) for c in page.eval_on_selector(selector, script)}
 
 
+@pytest.mark.slow
 def test_its_own_policy_blocks_nothing(opened):
     assert angle(opened()) == "RAO 30 CAU 20"
 
 
+@pytest.mark.slow
 def test_dragging_turns_the_c_arm(opened):
     page = opened()
     page.locator("#canvas").scroll_into_view_if_needed()
@@ -120,6 +122,7 @@ def test_foreshortening_follows_the_direction(opened, result):
         np.testing.assert_allclose(found, parallel(*angles), atol=0.011)
 
 
+@pytest.mark.slow
 def test_colours_and_legends(opened):
     page = opened()
     before = colors(page, "#canvas")
@@ -135,6 +138,7 @@ def test_the_best_further_view_is_shown(opened, result):
     assert angle(page) == result.summary()["best_further_view"]["name"]
 
 
+@pytest.mark.slow
 def test_the_tree_lies_on_the_vessels_of_each_picture(opened):
     """Good fits are green; the lines can be hidden."""
     page = opened()
@@ -145,6 +149,7 @@ def test_the_tree_lies_on_the_vessels_of_each_picture(opened):
     assert colors(page, ".lines[data-view='0']") == set()
 
 
+@pytest.mark.slow
 def test_the_curve_points_at_its_place_in_3d_and_in_the_views(opened):
     page = opened()
     yellow = (255, 216, 77)
@@ -173,6 +178,7 @@ def test_hovering_a_row_dims_the_others_and_a_click_chooses(opened):
     assert page.locator("#branches tr.chosen").get_attribute("data-branch") == "2"
 
 
+@pytest.mark.slow
 def test_fingers_on_a_tablet(opened):
     page = opened(width=820, touch=True)
     page.locator("#branches tr").nth(2).tap()
@@ -195,6 +201,7 @@ def test_fingers_on_a_tablet(opened):
     assert angle(page) == "RAO 40 CRA 0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 1024, 768])
 def test_nothing_is_cut_off(opened, width):
     page = opened(width=width)

@@ -172,6 +172,7 @@ def long_tree(branches=40, points=400):
     return Tree(nodes_mm=np.stack([line[0], line[-1]]), branches=made)
 
 
+@pytest.mark.slow
 def test_report_stays_small_for_noisy_pictures_and_long_trees(result):
     tree = long_tree()
     long = with_tree(result, tree)

@@ -82,6 +82,7 @@ FINE = tuple(view.resized(512, 512) for view in TOLD)
 SMOOTH = PoseOptions(fine_mm=0.85)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5, 6])
 @pytest.mark.parametrize("turned", [-2.0, 0.5, 1.0])
 def test_calibrated_pictures_show_the_angle(turned, seed):

@@ -36,6 +36,7 @@ def test_a_move_between_the_runs_is_built_into_the_views_and_said():
     assert placed.views[0] is views[0]
 
 
+@pytest.mark.slow
 def test_two_trees_are_refused_when_asked_with_what_was_measured():
     angiograms, views = pair(seeds=(4, 9), calibrated=True)
     placed = register(angiograms, views, OPTIONS, never)
@@ -44,6 +45,7 @@ def test_two_trees_are_refused_when_asked_with_what_was_measured():
         placed.or_refuse()
 
 
+@pytest.mark.slow
 def test_outlines_of_two_trees_that_agree_by_chance_are_refused_by_where_vessels_end():
     angiograms, views = pair(seeds=(4, 9), stranger=True)
     placed = register(angiograms, views, OPTIONS, never)

@@ -93,6 +93,7 @@ def test_the_hull_among_given_points_is_the_hull_there():
     assert part.index.tolist() == sorted(part.index.tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lattices", [1, 2])
 def test_the_option_reaches_the_reconstruction(lattices, monkeypatch):
     """The demo, judged on one lattice or two: one inference a lattice."""

@@ -30,6 +30,7 @@ def views(radius_mm: float, pixel_mm: float = 0.15):
     return [extract_vessels(picture, OPTIONS.imaging)] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius_mm", [0.25, 0.35, 1.5])
 def test_a_predictor_of_coarse_cells_keeps_the_cells_asked_for(radius_mm: float) -> None:
     shipped = read_model(MULTI.path, (MULTI,)).spec if MULTI.path else {"spacing_mm": [0.85, 1.5]}

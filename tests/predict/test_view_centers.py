@@ -111,6 +111,7 @@ def test_the_result_names_the_predictor(tmp_path):
     assert Engine(TINY, options=unasked).reconstruct(angiograms, grid).predictor == "paper"
 
 
+@pytest.mark.slow
 def test_from_the_models_centres_through_the_optimisation_to_a_tree():
     angiograms, grid, _ = tiny_case()
     result = Engine(TINY, options=PAPER).reconstruct(angiograms, grid)
@@ -127,6 +128,7 @@ def test_a_model_of_the_other_kind_is_refused():
         Engine(TINY, options=RunOptions(predict=PredictOptions(predictor="multi")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wanted", ["auto", "multi", "paper"])
 def test_without_a_model_the_hull_is_thinned_and_the_result_says_so(wanted, monkeypatch, tmp_path):
     monkeypatch.setattr("gcar_deploy.models.spec.resources.files", lambda _: tmp_path)

@@ -163,6 +163,7 @@ def test_sizes_that_no_human_has_are_doubted():
     assert check_human_range(tube((0, 0, 1), 5.0, 30.0)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "outcome"), [(1.0, "ok"), (1.35, "degraded"), (2.0, "refused")])
 def test_a_whole_run_judges_the_scale(factor, outcome):
     """Two views of a tube at 0.27 mm pixels, whose counts are said to mean more than they do."""

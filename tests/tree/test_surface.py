@@ -35,6 +35,7 @@ def test_volume_and_place_of_a_tube():
     np.testing.assert_allclose(r, 2.0, atol=0.03)
 
 
+@pytest.mark.slow
 def test_stl_is_read_by_vtk(tmp_path):
     vtk = pytest.importorskip("vtk")
     surface = lumen_surface(fork())

@@ -42,6 +42,7 @@ def test_vessels_in_one_place_count_once_and_behind_each_other_twice():
     assert alone.max() == pytest.approx(3.0, rel=0.02) and both.max() > 5.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tree", [fork(), seven()], ids=["fork", "seven"])
 @pytest.mark.parametrize("views", [two_views(), PAIR], ids=["fine", "coarse"])
 def test_the_model_shows_what_the_oracle_shows(tree, views):

@@ -77,6 +77,7 @@ def until_order(page, case, has):
     until(page, lambda: has(order_of(case)))
 
 
+@pytest.mark.slow
 def test_demo_to_result_to_deletion_and_back(serve, browse, engine, tmp_path):
     """One click to a result; a branch deleted, undone and redone; the order repeats the bytes."""
     address, cases = serve()
@@ -242,6 +243,7 @@ def test_corrections_mend_a_raw_case(serve, engine):
     assert found[0] + 0.015 < found[1] and found[1] > 0.82, found
 
 
+@pytest.mark.slow
 def test_tools_write_what_they_say(serve, browse):
     """Paint, cut, region and ostium, and taking single corrections back; by keyboard as well."""
     address, cases = serve(lambda desk: desk.demo().id)
@@ -286,6 +288,7 @@ def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width):
     nothing_serious(page)
 
 
+@pytest.mark.slow
 def test_one_printed_page(serve, browse):
     address, _ = serve(lambda desk: desk.demo().id)
     page = browse(address)

@@ -194,6 +194,7 @@ def test_scores_of_frame_pairs_are_told_from_either_view(ask, desk):
     assert case.scores_with(2) == {"1": [[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]}
 
 
+@pytest.mark.slow
 def test_frames_of_two_runs_come_with_how_they_go_together(ask, desk, tmp_path):
     import cv2
 

@@ -224,6 +224,7 @@ def test_runs_that_want_their_pixel_spacing_get_it(serving):
     assert job["result"]["refiner"] == "none"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["upload", "folder"])
 def test_a_mask_comes_with_the_order(serving, way):
     ask, folder = serving

@@ -74,6 +74,7 @@ def sent_to(server, folder, named_runs, title="ARCHIVE"):
         server.shutdown()
 
 
+@pytest.mark.slow
 def test_surface_and_overlays_arrive_in_the_study_of_the_pictures(folder, named_runs):
     server, got = archive()
     assert sent_to(server, folder, named_runs) == {"sent": 4, "send_error": None}
@@ -95,6 +96,7 @@ def test_surface_and_overlays_arrive_in_the_study_of_the_pictures(folder, named_
     assert len({data.SOPInstanceUID for data in got}) == 4
 
 
+@pytest.mark.slow
 def test_a_kind_that_the_peer_does_not_take_keeps_nothing_else_back(folder, named_runs):
     server, got = archive(kinds=ALL[1:])
     told = sent_to(server, folder, named_runs)
@@ -103,6 +105,7 @@ def test_a_kind_that_the_peer_does_not_take_keeps_nothing_else_back(folder, name
                         told["send_error"])  # fmt: skip
 
 
+@pytest.mark.slow
 def test_refusals_are_one_sentence(folder, named_runs):
     server, _ = archive(status=0xA700)
     told = sent_to(server, folder, named_runs)
