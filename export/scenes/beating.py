@@ -132,7 +132,9 @@ class RunMotion:
     bolus: Scalars
 
 
-def random_run(rng: np.random.Generator, frames: int, beats: float, table_mm: float) -> RunMotion:
+def random_run(
+    rng: np.random.Generator, frames: int, beats: float, table_mm: float, wait: float = 0.0
+) -> RunMotion:
     """Draw beats of uneven length, breathing, and when contrast is given.
 
     Parameters
@@ -140,6 +142,7 @@ def random_run(rng: np.random.Generator, frames: int, beats: float, table_mm: fl
     frames : int
     beats : of the whole run, give or take a fifth
     table_mm : standard deviation along each axis of where the patient lies
+    wait : frames by which contrast comes later; at 0 half of all runs begin filled
     """
     rate = beats * rng.uniform(0.8, 1.2) / frames
     # Beats differ by some percent: the phase is a smooth curve of time.
@@ -151,4 +154,5 @@ def random_run(rng: np.random.Generator, frames: int, beats: float, table_mm: fl
     breath = rng.uniform(0, 6) * np.sin(2 * np.pi * (rng.uniform(0.2, 0.7) * time + rng.uniform()))
     way = unit(np.array([0.0, 0.35, 1.0]) + 0.2 * rng.normal(size=3))
     shift = (breath - breath[0])[:, None] * way + table_mm * rng.normal(size=3)
-    return RunMotion(phases, np.asarray(shift), np.arange(float(frames)) - rng.uniform(-5, 3))
+    bolus = np.arange(float(frames)) - rng.uniform(-5, 3) - wait
+    return RunMotion(phases, np.asarray(shift), bolus)

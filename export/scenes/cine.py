@@ -90,14 +90,17 @@ class CinePair:
         return np.sqrt(squares.mean(axis=2))
 
 
-def cine_pair(seed: int, number: int, frames: int = FRAMES) -> CinePair:
-    """Patient ``number`` of a population; the same for the same arguments."""
+def cine_pair(seed: int, number: int, frames: int = FRAMES, wait: float = 0.0) -> CinePair:
+    """Patient ``number`` of a population; the same for the same arguments.
+
+    ``wait``: frames by which contrast comes later, see ``random_run``.
+    """
     rng = np.random.default_rng([seed, number])
     style = (None, rough_style(rng), thin_style(rng))[rng.choice(3, p=[0.45, 0.4, 0.15])]
     tree = random_tree(rng, style).sides(SIDES[number % 2])
     beat = random_heartbeat(rng, tree)
     runs = tuple(
-        _run(rng, tree, beat, carm, random_run(rng, frames, BEATS, table))
+        _run(rng, tree, beat, carm, random_run(rng, frames, BEATS, table, wait))
         for carm, table in zip(_views(rng, tree), (0.0, TABLE_MM), strict=True)
     )
     return CinePair(tree, beat, (runs[0], runs[1]))

@@ -14,6 +14,7 @@ from gcar_deploy.frames.pairs import choose_pair
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.frame import ChosenFrame, FramePair
+from gcar_deploy.types import Image
 
 #: runs of fewer frames show no heartbeat
 LEAST_FRAMES = 4
@@ -21,11 +22,15 @@ LEAST_FRAMES = 4
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class SeenRun:
-    """A run with the C-arm that stood still for it, and what its grey values mean."""
+    """A run with the C-arm that stood still for it, and what its grey values mean.
+
+    ``kept``: its frames so far read, reduced.
+    """
 
     cine: Cine
     carm: CArm
     intensity: Intensity
+    kept: list[Image] = dataclasses.field(default_factory=list, repr=False)
 
 
 def choose_frames(
@@ -80,11 +85,18 @@ def choose_frames(
 
 def masses_of(run: SeenRun, report: Callable[[float], None] | None = None) -> RunMasses:
     """Read all frames of a run and find the contrast in them."""
-    small = []
-    for k in range(len(run.cine)):
-        small.append(reduced(run.cine.decode(k)))
-        _told(report, k + 1, len(run.cine))
+    small = reduced_frames(run, len(run.cine), report)
     return run_masses(small, run.carm, run.intensity, run.cine.valid)
+
+
+def reduced_frames(
+    run: SeenRun, count: int, report: Callable[[float], None] | None = None
+) -> list[Image]:
+    """Return the first frames of a run at the size that they are compared at, each read once."""
+    for k in range(len(run.kept), count):
+        run.kept.append(reduced(run.cine.decode(k)))
+        _told(report, k + 1, count)
+    return run.kept[:count]
 
 
 def pair_of(

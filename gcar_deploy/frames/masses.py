@@ -35,6 +35,8 @@ _NOISE, _LEAST_SHARE = 3.0, 0.25
 #: of what is narrow in a frame so much is left at least where anything moves, and so much of it
 #: stands elsewhere in the next frame
 _LEAST_LEFT, _LEAST_MOTION = 0.35, 0.1
+#: so many frames are asked whether vessels are dark
+_ASKED = 6
 #: smoothing of the profiles, mm at the isocentre
 _SIGMA_MM = 1.0
 
@@ -162,12 +164,15 @@ def _contrast(
 
 def _bright(stack: Array, carm: CArm, intensity: Intensity) -> tuple[Array, Mask]:
     """Frames with bright vessels in which paths about add up, and where nothing is shown."""
-    middle = stack[len(stack) // 2]
+    # A frame without contrast tells nothing of how vessels look: the one that tells most is asked.
+    some = stack[:: max(1, len(stack) // _ASKED)]
+    mm = carm.pixel_at_isocenter_mm
+    told = max(some, key=lambda one: enhance.vessels_are_dark(one, mm)[1])
     dark = is_dark(
-        Angiogram(view_id="", carm=carm, pixels=middle, bit_depth=8, intensity=intensity, sha256="")
+        Angiogram(view_id="", carm=carm, pixels=told, bit_depth=8, intensity=intensity, sha256="")
     )
     if intensity.kind == "attenuation":
-        return -stack if dark else stack.copy(), np.zeros(middle.shape, bool)
+        return -stack if dark else stack.copy(), np.zeros(told.shape, bool)
     holes = enhance.collimator(np.median(stack, axis=0).astype(np.float32))
     # One white level for the whole run: what its display does to one frame it does to all.
     level = np.asarray(stack if dark else stack.max() - stack, dtype=np.float32)

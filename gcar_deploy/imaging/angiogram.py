@@ -43,6 +43,8 @@ class Angiogram:
         What the user takes from, and adds to, the vessels that are found.
     frame : ChosenFrame or None
         Which frame of a run it is, where the program chose it.
+    bare : tuple of (rows, cols) float32
+        Frames of the same run before contrast came; what is a line there is no vessel.
     """
 
     view_id: str
@@ -56,10 +58,11 @@ class Angiogram:
     erased: Mask | None = None
     painted: Mask | None = None
     frame: ChosenFrame | None = None
+    bare: tuple[Image, ...] = ()
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)
-        for array in (self.valid, self.mask, self.erased, self.painted):
+        for array in (self.valid, self.mask, self.erased, self.painted, *self.bare):
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
 

@@ -58,7 +58,7 @@ def inward_px(valid: Mask) -> Image:
 
 
 def cut_out(angiogram: Angiogram, box: Box) -> Angiogram:
-    """Return the part of a picture within a box, with its view and without what was drawn in it."""
+    """Return the part of a picture within a box, without what was drawn in it."""
     top, bottom, left, right = box
     rows, columns = slice(top, bottom), slice(left, right)
     valid = angiogram.valid
@@ -69,6 +69,7 @@ def cut_out(angiogram: Angiogram, box: Box) -> Angiogram:
         valid=None if valid is None else valid[rows, columns],
         erased=None,
         painted=None,
+        bare=tuple(np.ascontiguousarray(one[rows, columns]) for one in angiogram.bare),
     )
 
 

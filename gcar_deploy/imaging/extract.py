@@ -21,6 +21,7 @@ from gcar_deploy.imaging.learned import learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.imaging.path_noise import vessels_in_noise
+from gcar_deploy.imaging.standing import what_came, without_standing
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
@@ -76,7 +77,10 @@ def extract_vessels(
     GeometryError
         ``path_length`` without ``mm_per_count``; it or ``mask`` declared dark.
     """
-    return edited(_found(angiogram, options, segmenter), angiogram)
+    found = _found(angiogram, options, segmenter)
+    if angiogram.bare and asks_network([angiogram]):
+        found = without_standing(found, *_frames(angiogram), ~found.valid)
+    return edited(found, angiogram)
 
 
 def _found(
@@ -107,7 +111,7 @@ def _found(
 
 def _under(grey: _Grey, *laws: str) -> _Grey:
     """Keep the pictures under these laws alone, and the one to look for vessels in."""
-    return {name: p for name, p in grey[0].items() if name in ("search", *laws)}, grey[1]
+    return {name: p for name, p in grey[0].items() if name in ("search", "came", *laws)}, grey[1]
 
 
 def _seen(
@@ -271,7 +275,19 @@ def _grey_values(angiogram: Angiogram) -> _Grey:
     """Pictures with bright vessels, and where there is no picture; see ``bright_vessels``."""
     dark = is_dark(angiogram)
     pictures, holes = bright_vessels(angiogram.pixels, angiogram.intensity.kind, dark)
-    return pictures, holes if angiogram.valid is None else holes | ~angiogram.valid
+    if angiogram.valid is not None:
+        holes = holes | ~angiogram.valid
+    if angiogram.bare:
+        pictures["came"] = what_came(*_frames(angiogram), holes)
+    return pictures, holes
+
+
+def _frames(angiogram: Angiogram) -> tuple[Image, list[Image]]:
+    """Picture to look for vessels in, vessels bright, and the same of the bare frames."""
+    kind, dark = angiogram.intensity.kind, is_dark(angiogram)
+    frames = [bright_vessels(one, kind, dark)[0] for one in (angiogram.pixels, *angiogram.bare)]
+    picture, *before = (next(iter(pictures.values())) for pictures in frames)
+    return picture, before
 
 
 def _from_grey(
@@ -287,7 +303,7 @@ def _from_grey(
     elif segmenter is not None:
         found, path_mm = learned_vessels(pictures, holes, pixel_mm, segmenter)
     else:
-        found = segment.segment(search, holes, pixel_mm)
+        found = segment.segment(search, holes, pixel_mm, pictures.get("came"))
     if found.catheter_mm > 0:
         _log.info(
             "view %s: %.0f mm of line taken for a catheter and left out",
@@ -332,7 +348,7 @@ def _contrast_path(
     """(rows, cols) float32, mm: contrast against the filled-in background, scaled by widths."""
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     estimate = calibrate.estimate_path(
-        {name: picture for name, picture in pictures.items() if name != "search"},
+        {name: p for name, p in pictures.items() if name not in ("search", "came")},
         found,
         pixel_mm,
     )

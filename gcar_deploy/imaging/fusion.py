@@ -35,14 +35,17 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
     VesselImage ; its ``others`` are ``learned`` and ``classic``, and where these hold lines that
     stand out on one side alone, all three without them
     """
-    classic, learned = _without(classic, learned.catheter), _without(learned, classic.catheter)
+    classic, learned = (
+        without_lines(classic, learned.catheter),
+        without_lines(learned, classic.catheter),
+    )
     classic = dataclasses.replace(classic, device=learned.device)
     others: tuple[VesselImage, ...] = (learned, classic)
     rims = one_sided(
         [(view.skeleton, view.path_mm > 0) for view in others], picture, ~learned.valid,
         learned.carm.pixel_at_isocenter_mm,
     )  # fmt: skip
-    less = tuple(_without(view, rim) for view, rim in zip(others, rims, strict=True))
+    less = tuple(without_lines(view, rim) for view, rim in zip(others, rims, strict=True))
     if any(a is not b for a, b in zip(less, others, strict=True)):
         others += (_both(less[1], less[0], picture), *less)
     return dataclasses.replace(_both(classic, learned, picture), others=others)
@@ -61,7 +64,7 @@ def _both(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
     )  # fmt: skip
 
 
-def _without(view: VesselImage, device: Mask | None) -> VesselImage:
+def without_lines(view: VesselImage, device: Mask | None) -> VesselImage:
     """Cut the lines that lie on a device, as wide as they are."""
     if device is None or not device.any():
         return view
@@ -82,7 +85,7 @@ def _without(view: VesselImage, device: Mask | None) -> VesselImage:
 
 def without_device(view: VesselImage, device: Mask | None, length_mm: float) -> VesselImage:
     """Cut the lines that lie on a device, and say where it is and how long."""
-    left = _without(view, device)
+    left = without_lines(view, device)
     if device is None:
         return left
     return dataclasses.replace(left, catheter=device & ~left.mask, catheter_mm=length_mm)

@@ -59,7 +59,7 @@ def learned_vessels(
     ----------
     pictures : name -> (rows, cols) float32, vessels bright
         ``search`` is what the network sees (the first where there is none), ``display`` is about
-        linear in the path.
+        linear in the path; ``came`` as in ``segment.segment``.
     holes : (rows, cols) bool, pixels without picture (collimator)
     pixel_mm : float, pixel size at the isocentre
     segmenter : Segmenter
@@ -79,6 +79,10 @@ def learned_vessels(
     reach, line = vessel_lines(np.where(work_holes, np.float32(0), seen.probability))
     told = device_map(segmenter, fine, seen, line, reach, work_holes)
     device = devices(told, reach, line, work, work_holes)
+    if "came" in pictures:
+        came = segment.resize(pictures["came"], work.shape[::-1]) > 0.5
+        new = skel.beside(reach, line, skel.mostly(line, came))
+        device, told = device & ~new, np.where(new, np.float32(0), told)
     other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]

@@ -73,6 +73,7 @@ def segment(
     picture: Image,
     holes: Mask,
     pixel_mm: float,
+    came: Image | None = None,
 ) -> Segmentation:
     """Find bright vessels.
 
@@ -84,6 +85,7 @@ def segment(
     picture : (rows, cols) float32, vessels bright
     holes : (rows, cols) bool, pixels without picture (collimator)
     pixel_mm : float, pixel size at the isocentre
+    came : (rows, cols) float32, 1 where contrast came since the run began; None: nobody knows
     """
     rows, columns = picture.shape
     work, work_holes, work_mm = at_working_size(picture, holes, pixel_mm)
@@ -92,6 +94,8 @@ def segment(
     response = np.where(work_holes, np.float32(0), found.response)
     line = centreline(response, ~work_holes, work_mm)
     taken = catheters(line, flat, found.sigma_px, ~work_holes, work_mm)
+    if came is not None:
+        taken &= ~skel.mostly(taken, resize(came, work.shape[::-1]) > 0.5)
     if taken.any():
         line = skel.strong_parts(line & ~taken, response, PART_SHARE)
     device = _drawn_lines(taken, found.sigma_px)

@@ -8,6 +8,8 @@ import numpy as np
 from gcar_deploy.types import Array, Image, Mask, Scalars
 
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+#: of a line so much is looked at to each side, pixels
+_AROUND_PX = 12
 _BLOCK = np.ones((3, 3), np.uint8)
 
 
@@ -196,6 +198,16 @@ def beside_alone(reach: Mask, skeleton: Mask, part: Mask) -> Mask:
         for own in (part, skeleton & ~part)
     )
     return reach & near & ~far
+
+
+def mostly(line: Mask, inside: Mask) -> Mask:
+    """Pixels of ``line`` around which most of it lies ``inside``."""
+    size = (2 * _AROUND_PX + 1,) * 2
+    count, share = (
+        cv2.boxFilter(own.astype(np.float32), -1, size, normalize=False)
+        for own in (line, line & inside)
+    )
+    return line & (share > 0.5 * count)
 
 
 def _to_line(skeleton: Mask) -> tuple[Array, Array]:

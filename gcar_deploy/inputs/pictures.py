@@ -22,7 +22,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.inputs.drawn import Drawn
-from gcar_deploy.inputs.runs import find_runs, together
+from gcar_deploy.inputs.runs import find_runs, seen_runs, together, with_bare
 
 #: a file, an array of counts, or a picture that already knows its C-arm
 Picture: TypeAlias = "str | Path | np.ndarray | Angiogram"
@@ -153,7 +153,8 @@ def _by_scene(
     notes = list(scene.warnings)
     angiograms = []
     runs = find_runs(views, options)
-    chosen = together(runs, scene, options)
+    seen = seen_runs(runs, scene, options)
+    chosen = together(runs, seen)
     for number, (picture, view) in enumerate(zip(views, scene.views, strict=True), start=1):
         if isinstance(picture, Angiogram):
             angiograms.append(picture)
@@ -170,7 +171,8 @@ def _by_scene(
                 notes.append(f"view {view.id}: frame {frame.number} of {frame.of}: {frame.reason}")
         else:
             angiograms.append(_angiogram(picture, view, options.imaging, notes))
-    return angiograms, scene.volume_grid(), notes
+    angiograms, more = with_bare(angiograms, runs, seen)
+    return angiograms, scene.volume_grid(), notes + more
 
 
 def _angiogram(
@@ -207,9 +209,11 @@ def _from_headers(
             )
     if len(paths) != len(views):
         raise UsageError("pictures in memory tell no geometry: give a scene")
-    chosen = together(find_runs(paths, options), None, options)
-    angiograms, scene, notes = read_views(paths, options.dicom, chosen)
-    return angiograms, scene.volume_grid(), notes
+    runs = find_runs(paths, options)
+    seen = seen_runs(runs, None, options)
+    angiograms, scene, notes = read_views(paths, options.dicom, together(runs, seen))
+    angiograms, more = with_bare(angiograms, runs, seen)
+    return angiograms, scene.volume_grid(), notes + more
 
 
 def _matched(

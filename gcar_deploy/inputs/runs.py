@@ -13,10 +13,13 @@ from gcar_deploy.dicom.choose import choose_frame
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import intensity_of, wanted_frames
 from gcar_deploy.errors import GcarError, GeometryError, UsageError
+from gcar_deploy.frames.bare import bare_before
 from gcar_deploy.frames.choose import SeenRun, choose_frames, masses_of, pair_of, stands_still
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Scene, match_picture
+from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.frame import ChosenFrame, FramePair
 from gcar_deploy.types import Image
 
@@ -67,20 +70,14 @@ def find_runs(views: Sequence[Any], options: RunOptions) -> Runs:
     files = {k: view for k, view in enumerate(views, start=1) if isinstance(view, (str, Path))}
     runs = [k for k, path in files.items() if is_dicom(path) or is_cine(path)]
     wanted = dict(zip(runs, wanted_frames(options.dicom, len(runs)), strict=True)) if runs else {}
-    # A frame that is asked for needs no look at the others.
-    looked = [k for k in runs if not is_dicom(files[k]) or _chooses(wanted)]
-    opened = {k: open_cine(files[k], options) for k in looked}
+    opened = {k: open_cine(files[k], options) for k in runs}
     return Runs(cines={k: c for k, c in opened.items() if c is not None}, wanted=wanted)
 
 
 def together(
-    runs: Runs, scene: Scene | None, options: RunOptions, report: Report | None = None
+    runs: Runs, seen: Mapping[int, SeenRun], report: Report | None = None
 ) -> dict[int, ChosenFrame]:
     """Choose the frames of the runs such that they go together.
-
-    Parameters
-    ----------
-    scene : geometry of the views; None where the headers tell it
 
     Returns
     -------
@@ -88,8 +85,31 @@ def together(
     """
     if not _chooses(runs.wanted):
         return {}
-    seen = seen_runs(runs, scene, options)
     return choose_frames(seen, {k: runs.wanted[k] for k in seen}, report)
+
+
+def with_bare(
+    angiograms: Sequence[Angiogram], runs: Runs, seen: Mapping[int, SeenRun]
+) -> tuple[list[Angiogram], list[str]]:
+    """Give pictures the frames of their runs before contrast came, and say which these are.
+
+    Parameters
+    ----------
+    angiograms : of all views, frames of runs among them
+    seen : number of the view, from 1 -> its run, where the C-arm stood still
+    """
+    out, notes = list(angiograms), []
+    for k, run in seen.items():
+        own = out[k - 1]
+        number = runs.wanted[k] if own.frame is None else own.frame.number
+        frames = bare_before(run, number - 1) if number and asks_network([own]) else ()
+        if frames:
+            out[k - 1] = dataclasses.replace(own, bare=tuple(map(run.cine.decode, frames)))
+            notes.append(
+                f"view {own.view_id}: frames {frames[0] + 1} .. {frames[-1] + 1} hold no contrast "
+                "yet; lines that stand in them are no vessels"
+            )
+    return out, notes
 
 
 def seen_runs(runs: Runs, scene: Scene | None, options: RunOptions) -> dict[int, SeenRun]:
