@@ -110,13 +110,16 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
     from gcar_deploy.geometry.scene import Intensity
     from gcar_deploy.imaging.angiogram import Angiogram
     from gcar_deploy.imaging.read import read_picture
+    from gcar_deploy.inputs.runs import find_runs, seen_runs, with_bare
 
-    valid, pixel_mm = None, meaning.pixel_mm
+    valid, pixel_mm, chosen = None, meaning.pixel_mm, None
     notes: list[str] = []
+    options = order.options(RunOptions())
     if is_dicom(picture):
-        dicom = order.options(RunOptions()).dicom
+        dicom = options.dicom
         run = read_run(picture, dicom, wanted_frames(dicom, 1)[0])
         pixels, valid = (run.pixels, run.header.bits, run.header.sha256), run.valid
+        chosen = run.chosen
         notes += run.notes
         if pixel_mm is None:
             try:
@@ -135,4 +138,7 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
             "(150 mm for the longer side); gcar run knows it from the geometry, and --pixel-mm "
             "tells it here"
         )
-    return dataclasses.replace(angiogram, valid=valid), notes
+    angiogram = dataclasses.replace(angiogram, valid=valid, frame=chosen)
+    runs = find_runs([picture], options)
+    (angiogram,), more = with_bare([angiogram], runs, seen_runs(runs, None, options))
+    return angiogram, notes + more

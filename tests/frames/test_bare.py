@@ -16,6 +16,8 @@ from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.inputs.pictures import prepare
 from gcar_export.scenes.cine import cine_pair
 from gcar_export.studies.frame_pairs import CHOSEN_ON
+from tests.cli.conftest import gcar
+from tests.dicom.files import classic, save
 
 CARM = CArm(
     primary_angle_deg=0.0, secondary_angle_deg=0.0, sod_mm=750.0, sdd_mm=1000.0, rows=256,
@@ -125,3 +127,24 @@ def test_pictures_and_early_frames_know_none(patient):
     one = folder / "run2" / "frame20.png"
     angiograms, _, _ = prepare([folder / "run1", one], folder / "geom.json", early)
     assert [a.bare for a in angiograms] == [(), ()]
+
+
+def test_dicom_runs_know_them_in_run_and_in_enhance(tmp_path):
+    cine = _run(6).cine
+    pixels = np.stack([cine.decode(k) for k in range(len(cine))]).astype(np.uint8)
+    spacing = {"ImagerPixelSpacing": ["0.6", "0.6"]}
+    views = [
+        save(classic(pixels, PositionerPrimaryAngle=angle, **spacing), tmp_path / f"run{angle}.dcm")
+        for angle in ("-40", "30")
+    ]
+    options = RunOptions(dicom=DicomOptions(frames=(12,)))
+    angiograms, _, notes = prepare(views, None, options)
+    for one in angiograms:
+        np.testing.assert_array_equal(one.bare, pixels[:5])
+    assert sum("frames 1 .. 5 hold no contrast yet" in note for note in notes) == 2
+    told = gcar("enhance", views[0], "--frame", "12", "--out", tmp_path / "seen")
+    assert told.code == 0 and "frames 1 .. 5 hold no contrast yet" in told.err
+    mask = cv2.imread(str(tmp_path / "seen" / "mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    catheter = np.zeros(mask.shape, np.uint8)
+    cv2.polylines(catheter, [_course(6 * np.sin(2 * np.pi * 11 / 5))[:3]], False, 1, 1)
+    assert mask[catheter > 0].mean() < 0.2 and mask.mean() > 0.02
