@@ -32,7 +32,7 @@ from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
-from gcar_export.scenes.trees import random_tree, rough_style, thin_style
+from gcar_export.scenes.trees import any_style, random_tree
 
 #: enlargement of a picture that fills the network's field, and how far it is turned, degrees
 ZOOM, TURN_DEG = (1.0, 1.2), 8.0
@@ -98,8 +98,7 @@ def _frame(rng: np.random.Generator, seed: int, index: int) -> tuple[Array, Mask
 
 def _raw(rng: np.random.Generator) -> tuple[Array, Mask]:
     """Pixels and vessel of a raw picture of a generated tree, of any contrast and display."""
-    style = [None, thin_style(rng), rough_style(rng)][int(rng.integers(3))]
-    tree = random_tree(rng, style)
+    tree = random_tree(rng, any_style(rng))
     carm = clinical_geometry(2)[0][int(rng.integers(2))].turned(*(_SPREAD_DEG * rng.normal(size=2)))
     path_mm = path_lengths(carm, *tree.segments())
     pixels = raw_picture(path_mm, rng, random_options(rng))

@@ -109,6 +109,11 @@ def rough_style(rng: np.random.Generator) -> TreeStyle:
     )
 
 
+def any_style(rng: np.random.Generator) -> TreeStyle | None:
+    """Draw one of the three: plain (None), thin, rough."""
+    return [None, thin_style(rng), rough_style(rng)][int(rng.integers(3))]
+
+
 def random_tree(rng: np.random.Generator, style: TreeStyle | None = None) -> SyntheticTree:
     """Draw one patient's left and right coronary tree."""
     style = style or TreeStyle()

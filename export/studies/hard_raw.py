@@ -29,7 +29,7 @@ from gcar_deploy.types import Points
 from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
-from gcar_export.scenes.trees import random_tree, rough_style, thin_style
+from gcar_export.scenes.trees import any_style, random_tree
 from gcar_export.studies.pair_rows import Judged, head, row
 from gcar_export.studies.wrong_scenes import SIDES
 
@@ -54,8 +54,7 @@ class RawPair:
 def raw_pair(seed: int, number: int) -> RawPair:
     """Simulate the examination of tree ``number``: even ones are left, odd ones right."""
     rng = np.random.default_rng([seed, number])
-    style = [None, thin_style(rng), rough_style(rng)][int(rng.integers(3))]
-    tree = random_tree(rng, style).sides(SIDES[number % 2])
+    tree = random_tree(rng, any_style(rng)).sides(SIDES[number % 2])
     carms, _, grid = clinical_geometry(2)
     turned = [carm.turned(*(SPREAD_DEG * rng.normal(size=2))) for carm in carms]
     options = random_options(rng)
