@@ -12,6 +12,8 @@ from gcar_deploy.types import Scalars
 _FLOOR, _RISE = 0.45, 0.4
 #: what the first frames may differ by: noise, and a catheter that beats with the heart
 _SPREAD = 0.12
+#: frames before the one that is taken that are read: six seconds at 15 a second
+_BACK = 90
 #: most frames that are worth looking at
 MOST = 6
 
@@ -37,6 +39,7 @@ def bare_before(run: SeenRun, frame: int) -> tuple[int, ...]:
     """Bare frames of a run before a frame (from 0): the same however that frame was chosen."""
     if frame < 2:
         return ()
-    small = reduced_frames(run, frame + 1)
+    first = max(0, frame - _BACK)
+    small = reduced_frames(run, range(first, frame + 1))
     masses = run_masses(small, run.carm, run.intensity, run.cine.valid)
-    return bare_frames(masses.filling) if masses.beats else ()
+    return tuple(first + k for k in bare_frames(masses.filling)) if masses.beats else ()

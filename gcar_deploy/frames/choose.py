@@ -24,13 +24,13 @@ LEAST_FRAMES = 4
 class SeenRun:
     """A run with the C-arm that stood still for it, and what its grey values mean.
 
-    ``kept``: its frames so far read, reduced.
+    ``kept``: number of a frame that was read, from 0 -> the frame, reduced.
     """
 
     cine: Cine
     carm: CArm
     intensity: Intensity
-    kept: list[Image] = dataclasses.field(default_factory=list, repr=False)
+    kept: dict[int, Image] = dataclasses.field(default_factory=dict, repr=False)
 
 
 def choose_frames(
@@ -85,18 +85,19 @@ def choose_frames(
 
 def masses_of(run: SeenRun, report: Callable[[float], None] | None = None) -> RunMasses:
     """Read all frames of a run and find the contrast in them."""
-    small = reduced_frames(run, len(run.cine), report)
+    small = reduced_frames(run, range(len(run.cine)), report)
     return run_masses(small, run.carm, run.intensity, run.cine.valid)
 
 
 def reduced_frames(
-    run: SeenRun, count: int, report: Callable[[float], None] | None = None
+    run: SeenRun, frames: range, report: Callable[[float], None] | None = None
 ) -> list[Image]:
-    """Return the first frames of a run at the size that they are compared at, each read once."""
-    for k in range(len(run.kept), count):
-        run.kept.append(reduced(run.cine.decode(k)))
-        _told(report, k + 1, count)
-    return run.kept[:count]
+    """Return frames of a run at the size that they are compared at, each read once."""
+    for k in frames:
+        if k not in run.kept:
+            run.kept[k] = reduced(run.cine.decode(k))
+        _told(report, k + 1 - frames.start, len(frames))
+    return [run.kept[k] for k in frames]
 
 
 def pair_of(

@@ -77,6 +77,20 @@ def test_a_run_that_begins_early_has_some_and_one_that_begins_filled_none():
     assert bare_before(_run(-5), 11) == ()
 
 
+def test_of_a_long_run_only_the_last_seconds_are_read():
+    short, read = _run(6), []
+
+    def late(k):
+        read.append(k)
+        return short.cine.read(min(max(0, k - 400), 11))
+
+    cine = Cine(name="long", count=422, read=late)
+    long = SeenRun(cine=cine, carm=CARM, intensity=Intensity(kind="raw"))
+    frames = bare_before(long, 421)
+    assert len(frames) == MOST and min(read) == frames[0] == 331 and 390 < frames[-1] < 406
+    assert len(read) == len(set(read)) == 91
+
+
 def test_a_phantom_at_rest_has_none():
     assert bare_before(_run(-5, still=True), 11) == ()
 
