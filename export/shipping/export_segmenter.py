@@ -32,7 +32,7 @@ from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
-from gcar_export.training.checkpoint import filled, read_manifest, read_tensors, weights
+from gcar_export.training.checkpoint import best_weights, filled, read_manifest, read_tensors
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.segmenter_start import begin_with, devices_of
@@ -92,8 +92,7 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
     config = dict(json.loads((path.parent / "manifest.json").read_text())["config"])
     config["width"] = tuple(config["width"])
     net = MaskUNet(MaskUNetConfig(**config))
-    data = load_file(path)
-    net.load_state_dict(weights(data))
+    net.load_state_dict(best_weights(load_file(path)))
     return net.eval()
 
 

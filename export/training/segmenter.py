@@ -1,36 +1,29 @@
 """Train the segmentation network on generated and real angiograms, in pieces of any length.
 
-A run is a folder: ``checkpoint.safetensors`` (weights, optimiser state, step), ``manifest.json``
-(options, versions, scores), ``log.csv``. Picture i is a function of (seed, i), the learning rate
-one of the step: a run that was stopped goes on where it was.
+A run is a folder (``run_folder``). Picture i is a function of (seed, i), the learning rate one of
+the step: a run that was stopped goes on where it was.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import json
-import os
-import platform
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import click
 import cv2
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import UsageError
 from gcar_export.scenes.angiograms import SIDE, training_pair
 from gcar_export.scenes.augmented import augmented_pair
 from gcar_export.scenes.expert_pictures import ExpertPicture, expert_pair, expert_pictures, folds
 from gcar_export.scenes.picture_pool import pooled
-from gcar_export.training.checkpoint import weights
+from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
+from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.segmenter_start import begin_with
 
 #: pictures with this seed are for choosing and reporting, never for training
@@ -51,6 +44,7 @@ class SegmenterOptions:
     fold : (number, of how many) that is left out of them; (0, 0) leaves none out
     real_share : float, of the pictures of a step, where there are real ones
     pictures : int, generated ones that are drawn; each is used many times, never twice the same
+    mean_steps : int, what is kept is the mean of the weights over about so many (``mean_weights``)
     crop : int, side of what is cut out of a picture, pixels; a multiple of the network's stride
     """
 
@@ -62,6 +56,7 @@ class SegmenterOptions:
     learning_rate: float = 2e-3
     weight_decay: float = 1e-4
     validation_pictures: int = 40
+    mean_steps: int = 200
     save_every: int = 50
     bfloat16: bool = True
     device: str = "cpu"
@@ -296,36 +291,48 @@ def train(
     call with fewer ``steps``. A new run begins with the weights of ``begin_from`` if given, a
     checkpoint or an ONNX model. Generated pictures are kept in ``pool``, by default in ``out``.
     """
-    out.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
     real = real_pictures(options.real, options.fold)
     net = MaskUNet(MaskUNetConfig()).to(options.device).train()
     # channels_last only orders the memory; the stubs of Module.to do not know it
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    started = None
-    if begin_from is not None:
-        started = begin_with(net, begin_from)
-    elif (out / "manifest.json").exists():
-        started = json.loads((out / "manifest.json").read_text()).get("warm_start")
+    started = None if begin_from is None else begin_with(net, begin_from)
     optimiser = torch.optim.AdamW(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
-    step = _resume(out, net, optimiser)
-    began, losses = time.time(), []
-    with click.progressbar(length=options.steps, label="segmenter", file=sys.stderr) as bar:
-        bar.update(step)
-        for x, y in batches(options, pool or out / "pool", real, step, workers):
-            if minutes is not None and time.time() - began > 60 * minutes:
-                break
-            for group in optimiser.param_groups:
-                group["lr"] = learning_rate(options, step)
-            losses.append(_step(net, optimiser, (x, y), options))
-            step += 1
-            bar.update(1)
-            if step % options.save_every == 0:
-                _checkpoint(out, net, optimiser, step, options, losses, None, started)
-    _checkpoint(out, net, optimiser, step, options, losses, validate(net, options), started)
+    folder = RunFolder(
+        out,
+        {
+            "network": "mask-unet",
+            "config": dataclasses.asdict(net.config),
+            "seed": options.seed,
+            "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
+            "warm_start": started,
+            "data": "generated angiograms: gcar_export.scenes.picture_pool"
+            + ("; crops of real ones with expert masks" if options.real else ""),
+        },
+    )
+    mean = MeanWeights(net, options.mean_steps)
+    step = folder.resume(net, optimiser, mean.net)
+    line = ProgressLine(step, options.steps, options.batch, "pictures")
+    began = time.monotonic()
+    losses: list[float] = []
+    for pair in batches(options, pool or out / "pool", real, step, workers):
+        if minutes is not None and time.monotonic() - began > 60 * minutes:
+            break
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(options, step)
+        losses.append(_step(net, optimiser, pair, options))
+        step += 1
+        mean.add(net, step)
+        line.show(step, losses)
+        if step % options.save_every == 0 and step < options.steps:
+            folder.save(net, optimiser, step, mean=mean.net)
+    dice = validate(mean.net, options)
+    told = {"validation": {"dice": dice}, "validation_seed": VALIDATION_SEED}
+    folder.save(net, optimiser, step, told, mean.net)
+    folder.log(step, float(np.mean(losses[-100:] or [np.nan])), {"all": told["validation"]})
 
 
 def _step(
@@ -342,55 +349,3 @@ def _step(
     if bool(torch.isfinite(norm)):
         optimiser.step()
     return float(loss.detach())
-
-
-def _resume(out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer) -> int:
-    path = out / "checkpoint.safetensors"
-    if not path.exists():
-        return 0
-    data = load_file(path)
-    net.load_state_dict(weights(data))
-    state = {}
-    for n, (name, _) in enumerate(net.named_parameters()):
-        if f"opt.{name}.exp_avg" in data:
-            state[n] = {k: data[f"opt.{name}.{k}"] for k in ("exp_avg", "exp_avg_sq", "step")}
-    groups = optimiser.state_dict()["param_groups"]
-    optimiser.load_state_dict({"state": state, "param_groups": groups})
-    return int(data["step"])
-
-
-def _checkpoint(
-    out: Path, net: MaskUNet, optimiser: torch.optim.Optimizer, step: int,
-    options: SegmenterOptions, losses: Sequence[float], dice: float | None,
-    started: str | None,
-) -> None:  # fmt: skip
-    data = {f"net.{k}": v.detach().clone().contiguous() for k, v in net.state_dict().items()}
-    for name, p in net.named_parameters():
-        for key, value in optimiser.state.get(p, {}).items():
-            data[f"opt.{name}.{key}"] = value.detach().clone().contiguous()
-    data["step"] = torch.tensor(step)
-    save_file(data, out / "checkpoint.tmp")
-    os.replace(out / "checkpoint.tmp", out / "checkpoint.safetensors")
-    manifest = {
-        "schema": "gcar-training/1",
-        "network": "mask-unet",
-        "config": dataclasses.asdict(net.config),
-        "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
-        "data": "generated angiograms: gcar_export.scenes.picture_pool"
-        + ("; crops of real ones with expert masks" if options.real else ""),
-        "warm_start": started,
-        "step": step,
-        "validation_seed": VALIDATION_SEED,
-        "validation_dice": dice,
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
-    (out / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
-    new = not (out / "log.csv").exists()
-    with (out / "log.csv").open("a", newline="") as f:
-        writer = csv.writer(f)
-        if new:
-            writer.writerow(["step", "loss", "dice"])
-        recent = f"{np.mean(losses[-50:]):.4f}" if losses else ""
-        writer.writerow([step, recent, "" if dice is None else f"{dice:.4f}"])

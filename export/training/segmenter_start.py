@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError
-from gcar_export.training.checkpoint import WEIGHTS, weights
+from gcar_export.training.checkpoint import WEIGHTS, best_weights
 from gcar_export.training.networks.line_net import LineNet
 from gcar_export.training.networks.mask_unet import MaskUNet
 
@@ -25,7 +25,9 @@ def begin_with(net: MaskUNet, path: Path) -> str:
     ModelError
         A weight is missing or has another shape.
     """
-    found = model_weights(path, WEIGHTS) if path.suffix == ".onnx" else weights(load_file(path))
+    found = (
+        model_weights(path, WEIGHTS) if path.suffix == ".onnx" else best_weights(load_file(path))
+    )
     own = net.state_dict()
     for name, value in own.items():
         given = found.get(name)
