@@ -8,10 +8,9 @@ pictures tell what is vessel, as an expert drew it; devices are drawn into them.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -31,10 +30,10 @@ from gcar_export.scenes.device_pictures import (
     pooled_device_picture,
 )
 from gcar_export.scenes.expert_pictures import ExpertPicture
-from gcar_export.training.mean_weights import MeanWeights
+from gcar_export.training.loop import Lesson, learn
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
-from gcar_export.training.run_folder import ProgressLine, RunFolder
-from gcar_export.training.segmenter import changes, learning_rate, real_pictures
+from gcar_export.training.run_folder import RunFolder
+from gcar_export.training.segmenter import changes, real_pictures
 from gcar_export.training.segmenter_start import devices_of, vessels_sha256
 
 #: pictures of this seed are for choosing, never for training
@@ -73,6 +72,8 @@ class DeviceOptions:
     fold: tuple[int, int] = (0, 0)
 
 
+#: points (n, POINT), near (n, NEAR) and labels (n,) of each picture of a step
+Batch: TypeAlias = "list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]"
 #: three steps, for tests
 TINY = DeviceOptions(
     steps=3, decay_steps=1, warmup_steps=1, batch=1, validation_pictures=1, save_every=2,
@@ -124,7 +125,7 @@ class Pictures:
         """Picture ``index`` of the stream ``seed``."""
         return pooled_device_picture(self.pool, self.stream, seed, index, self.segmenter, self.real)
 
-    def batch(self, step: int) -> list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    def batch(self, step: int) -> Batch:
         """Points (n, POINT), near (n, NEAR) and labels (n,) of each picture of a step."""
         some = []
         for k in range(self.options.batch):
@@ -190,9 +191,6 @@ def train(
     pictures = Pictures(options, pool or out / "pool", KIND.path, real)
     net = LineNet(LineNetConfig()).train()
     first = None if begin_from is None else devices_of(net, begin_from)
-    optimiser = torch.optim.AdamW(
-        net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
-    )
     folder = RunFolder(
         out,
         {
@@ -204,40 +202,20 @@ def train(
             "warm_start": first,
             "data": "gcar_export.scenes.device_pictures"
             + ("; real ones with expert masks tell what is vessel" if options.real else ""),
+            "validation_seed": VALIDATION_SEED,
         },
     )
-    mean = MeanWeights(net, options.mean_steps)
-    step = folder.resume(net, optimiser, mean.net)
-    line = ProgressLine(step, options.steps, options.batch, "pictures")
-    began = time.monotonic()
-    losses: list[float] = []
-    while step < options.steps and (minutes is None or time.monotonic() - began < 60 * minutes):
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(options, step)
-        losses.append(_step(net, optimiser, pictures.batch(step)))
-        step += 1
-        mean.add(net, step)
-        line.show(step, losses)
-        if step % options.save_every == 0 and step < options.steps:
-            folder.save(net, optimiser, step, mean=mean.net)
-    scores = validate(mean.net, pictures)
-    told = {"validation": scores, "validation_seed": VALIDATION_SEED}
-    folder.save(net, optimiser, step, told, mean.net)
-    folder.log(step, float(np.nanmean(losses[-100:] or [np.nan])), {"all": scores})
+    lesson: Lesson[LineNet, Batch] = Lesson(
+        lambda step: (pictures.batch(k) for k in range(step, options.steps)),
+        lambda batch: _loss(net, batch),
+        lambda mean: validate(mean, pictures),
+    )
+    learn(folder, net, options, lesson, minutes)
 
 
-def _step(
-    net: LineNet, optimiser: torch.optim.Optimizer,
-    batch: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]],
-) -> float:  # fmt: skip
+def _loss(net: LineNet, batch: Batch) -> torch.Tensor | None:
     asked = sum(int((label != NOT_ASKED).sum()) for *_, label in batch)
     if not asked:
-        return float("nan")
+        return None
     parts = [points_loss(net(points, near), label) for points, near, label in batch]
-    loss = torch.stack(parts).sum() / asked
-    optimiser.zero_grad()
-    loss.backward()
-    norm = torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-    if bool(torch.isfinite(norm)):
-        optimiser.step()
-    return float(loss.detach())
+    return torch.stack(parts).sum() / asked

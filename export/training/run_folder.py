@@ -183,7 +183,7 @@ class ProgressLine:
         rate = (step - self.first) / max(time.monotonic() - self.began, 1e-9)
         left = (self.steps - step) / max(rate, 1e-9) / 60
         click.echo(
-            f"step {step}/{self.steps}  loss {np.mean(losses[-100:]):.4f}  "
+            f"step {step}/{self.steps}  loss {np.nanmean(losses[-100:]):.4f}  "
             f"{rate * self.per_step:.2f} {self.what}/s  {left:.0f} min left",
             err=True,
         )

@@ -7,10 +7,9 @@ the step: a run that was stopped goes on where it was.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,9 +20,9 @@ from gcar_export.scenes.angiograms import SIDE, training_pair
 from gcar_export.scenes.augmented import augmented_pair
 from gcar_export.scenes.expert_pictures import ExpertPicture, expert_pair, expert_pictures, folds
 from gcar_export.scenes.picture_pool import pooled
-from gcar_export.training.mean_weights import MeanWeights
+from gcar_export.training.loop import Lesson, Schedule, learn
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.run_folder import ProgressLine, RunFolder
+from gcar_export.training.run_folder import RunFolder
 from gcar_export.training.segmenter_start import begin_with
 
 #: pictures with this seed are for choosing and reporting, never for training
@@ -131,33 +130,6 @@ def fold_of(text: str) -> tuple[int, int]:
     if not (slash and number.isdigit() and of.isdigit()):
         raise UsageError(f"fold {text}: must be K/N, for example 1/5")
     return int(number), int(of)
-
-
-class Schedule(Protocol):
-    """What the learning rate of a step depends on."""
-
-    @property
-    def steps(self) -> int:
-        """Steps in all."""
-
-    @property
-    def decay_steps(self) -> int:
-        """Of them the last ones, in which the rate falls to zero."""
-
-    @property
-    def warmup_steps(self) -> int:
-        """Of them the first ones, in which it rises."""
-
-    @property
-    def learning_rate(self) -> float:
-        """In between."""
-
-
-def learning_rate(options: Schedule, step: int) -> float:
-    """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
-    up = min(1.0, (step + 1) / options.warmup_steps)
-    down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
-    return options.learning_rate * up * down
 
 
 def mask_loss(logits: torch.Tensor, truth: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -298,9 +270,6 @@ def train(
     # channels_last only orders the memory; the stubs of Module.to do not know it
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     started = None if begin_from is None else begin_with(net, begin_from)
-    optimiser = torch.optim.AdamW(
-        net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
-    )
     folder = RunFolder(
         out,
         {
@@ -311,41 +280,19 @@ def train(
             "warm_start": started,
             "data": "generated angiograms: gcar_export.scenes.picture_pool"
             + ("; crops of real ones with expert masks" if options.real else ""),
+            "validation_seed": VALIDATION_SEED,
         },
     )
-    mean = MeanWeights(net, options.mean_steps)
-    step = folder.resume(net, optimiser, mean.net)
-    line = ProgressLine(step, options.steps, options.batch, "pictures")
-    began = time.monotonic()
-    losses: list[float] = []
-    for pair in batches(options, pool or out / "pool", real, step, workers):
-        if minutes is not None and time.monotonic() - began > 60 * minutes:
-            break
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(options, step)
-        losses.append(_step(net, optimiser, pair, options))
-        step += 1
-        mean.add(net, step)
-        line.show(step, losses)
-        if step % options.save_every == 0 and step < options.steps:
-            folder.save(net, optimiser, step, mean=mean.net)
-    dice = validate(mean.net, options)
-    told = {"validation": {"dice": dice}, "validation_seed": VALIDATION_SEED}
-    folder.save(net, optimiser, step, told, mean.net)
-    folder.log(step, float(np.mean(losses[-100:] or [np.nan])), {"all": told["validation"]})
+    lesson: Lesson[MaskUNet, list[torch.Tensor]] = Lesson(
+        lambda step: batches(options, pool or out / "pool", real, step, workers),
+        lambda pair: _loss(net, pair, options),
+        lambda mean: {"dice": validate(mean, options)},
+    )
+    learn(folder, net, options, lesson, minutes)
 
 
-def _step(
-    net: MaskUNet, optimiser: torch.optim.Optimizer, pair: Sequence[torch.Tensor],
-    options: SegmenterOptions,
-) -> float:  # fmt: skip
+def _loss(net: MaskUNet, pair: Sequence[torch.Tensor], options: SegmenterOptions) -> torch.Tensor:
     x, y = pair[0].to(options.device, memory_format=torch.channels_last), pair[1].to(options.device)
     with torch.autocast(options.device, torch.bfloat16, enabled=options.bfloat16):
         maps = net(x)
-    loss = total_loss(maps.float(), y)
-    optimiser.zero_grad()
-    loss.backward()
-    norm = torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-    if bool(torch.isfinite(norm)):
-        optimiser.step()
-    return float(loss.detach())
+    return total_loss(maps.float(), y)

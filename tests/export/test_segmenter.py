@@ -42,7 +42,6 @@ from gcar_export.training.segmenter import (  # noqa: E402
     Stream,
     chord_loss,
     chosen,
-    learning_rate,
     line_loss,
     mask_loss,
     real_pictures,
@@ -154,13 +153,6 @@ def test_losses_are_least_at_the_truth():
     torch.testing.assert_close(
         total_loss(torch.stack([right, chord, right], 1), unknown), total_loss(both, unknown)
     )
-
-
-def test_schedule():
-    options = TINY.__class__(steps=100, decay_steps=50, warmup_steps=10)
-    rates = [learning_rate(options, k) for k in range(101)]
-    assert rates[0] < rates[9] == rates[49] == options.learning_rate
-    assert rates[75] == pytest.approx(options.learning_rate / 2) and rates[100] == 0
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,84 @@
+"""The loop that trainings share: what it minimises, keeps, passes over, and goes on from."""
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the export extra")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from gcar_export.training.loop import Lesson, learn, learning_rate  # noqa: E402
+from gcar_export.training.run_folder import RunFolder  # noqa: E402
+from gcar_export.training.segmenter import TINY, SegmenterOptions  # noqa: E402
+
+MANIFEST = {"network": "line", "config": {}, "seed": 1}
+
+
+def options(**changed):
+    given = {"steps": 60, "decay_steps": 30, "warmup_steps": 2, "learning_rate": 0.1,
+             "weight_decay": 0.0, "mean_steps": 5, "save_every": 7}  # fmt: skip
+    return SegmenterOptions(**(given | changed))
+
+
+def lesson(net, losses=None, steps=60):
+    """Fit y = 2 x - 1 exactly; of every third batch nothing is asked where ``losses`` counts."""
+
+    def loss_of(k):
+        if losses is not None and k % 3 == 0:
+            return None
+        x = torch.linspace(-1, 1, 5)[:, None] + 0.1 * (k % 4)
+        loss = ((net(x) - (2 * x - 1)) ** 2).mean()
+        if losses is not None:
+            losses.append(float(loss.detach()))
+        return loss
+
+    return Lesson(
+        lambda first: range(first, steps), loss_of,
+        lambda mean: {"slope": float(mean.weight.detach())},
+    )  # fmt: skip
+
+
+def line():
+    torch.manual_seed(3)
+    return torch.nn.Linear(1, 1)
+
+
+def test_a_line_is_learned_and_its_mean_is_kept(tmp_path):
+    net, losses = line(), []
+    longer = options(steps=150, decay_steps=100)
+    learn(RunFolder(tmp_path, MANIFEST), net, longer, lesson(net, losses, 150))
+    assert len(losses) == 100 and losses[-1] < 0.02 < 1 < losses[0]
+    kept = load_file(tmp_path / "checkpoint.safetensors")
+    assert float(kept["mean.weight"]) == pytest.approx(2, abs=0.05)
+    assert float(kept["mean.weight"]) != float(kept["net.weight"])
+    told = json.loads((tmp_path / "manifest.json").read_text())
+    assert told["step"] == 150 and told["validation"]["slope"] == float(kept["mean.weight"])
+
+
+def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
+    for name, pieces in (("one", [60]), ("two", [23, 60])):
+        for steps in pieces:
+            net = line()
+            learn(RunFolder(tmp_path / name, MANIFEST), net, options(), lesson(net, steps=steps))
+    one, two = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, two[name], err_msg=name)
+
+
+def test_a_gradient_that_is_not_finite_moves_nothing(tmp_path):
+    net = line()
+    before = net.weight.detach().clone()
+    torn = Lesson(lambda first: range(first, 60), lambda k: (net(torch.ones(1, 1)) / 0).sum(),
+                  lambda mean: {"slope": 0.0})  # fmt: skip
+    learn(RunFolder(tmp_path, MANIFEST), net, options(), torn)
+    torch.testing.assert_close(net.weight.detach(), before)
+
+
+def test_schedule():
+    given = TINY.__class__(steps=100, decay_steps=50, warmup_steps=10)
+    rates = [learning_rate(given, k) for k in range(101)]
+    assert rates[0] < rates[9] == rates[49] == given.learning_rate
+    assert rates[75] == pytest.approx(given.learning_rate / 2) and rates[100] == 0
