@@ -114,7 +114,7 @@ class EngineChoice:
         """Hold every numerical library of this process; before they are imported."""
         if self.threads is None:
             return
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ[name] = str(self.threads)
         import cv2
 

@@ -92,6 +92,15 @@ def test_the_shell_completes_verbs_and_options():
         assert f"plain,{wanted}" in done.stdout.splitlines(), done.stderr
 
 
+@pytest.mark.parametrize(("set_before", "then"), [(None, "1"), ("3", "3")])
+def test_products_are_not_shared_out_unless_that_was_asked(set_before, then, monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", set_before or "")
+    if set_before is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    assert gcar("--version").code == 0
+    assert os.environ["OPENBLAS_NUM_THREADS"] == then
+
+
 @pytest.mark.benchmark
 def test_help_is_quick():
     times = []
