@@ -16,8 +16,8 @@ from gcar_deploy.types import Array, Points, Scalars, Volume
 
 #: samples per voxel edge where the surface passes through.
 SAMPLES = 3
-#: capsule-voxel pairs handled at once; bounds the memory to some tens of MB.
-CHUNK = 200_000
+#: capsule-voxel pairs handled at once: what is made of them stays in the cache
+CHUNK = 80_000
 
 
 def tree_occupancy(tree: Tree, grid: Grid) -> Volume:

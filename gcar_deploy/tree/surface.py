@@ -68,9 +68,7 @@ def lumen_surface(tree: Tree, edge_mm: float | None = None) -> Surface:
     lattice = lumen_lattice(tree, edge_mm)
     vertices, faces, total = [], [], 0
     for origin, distance in _blocks(tree, lattice):
-        own, triangles, _, _ = marching_cubes(
-            distance, level=0.0, gradient_direction="descent", allow_degenerate=False
-        )
+        own, triangles, _, _ = marching_cubes(distance, level=0.0, gradient_direction="descent")
         vertices.append(own + origin)
         faces.append(triangles + np.int64(total))
         total += len(own)
@@ -87,13 +85,15 @@ def _blocks(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
     """
     number = np.full(-(-np.array(lattice.shape) // BLOCK) + 1, -1)
     cell, value = _near(tree, lattice)
-    # Block of each place and where in it, by tables along each axis: nothing is divided twice.
-    steps = np.array([number.shape[1] * number.shape[2], number.shape[2], 1])
-    block, place = np.zeros((2, len(cell)), np.int64)
-    for axis, x in enumerate(np.unravel_index(cell, lattice.shape)):
-        number_of, within = np.divmod(np.arange(lattice.shape[axis]), BLOCK)
-        block += (number_of * steps[axis])[x]
-        place += (within * BLOCK ** (2 - axis))[x]
+    # Places among all blocks, each block's in a row, by tables: nothing is divided twice.
+    size, steps = BLOCK**3, (number.shape[1] * number.shape[2], number.shape[2], 1)
+    along = [
+        np.arange(n) // BLOCK * (steps[axis] * size) + np.arange(n) % BLOCK * BLOCK ** (2 - axis)
+        for axis, n in enumerate(lattice.shape)
+    ]
+    column, z = np.divmod(cell, lattice.shape[2])
+    place = np.add.outer(along[0], along[1]).reshape(-1)[column] + along[2][z]
+    block = place // size
     flat = number.reshape(-1)
     flat[block] = 0
     occupied = np.argwhere(number == 0)
@@ -101,9 +101,10 @@ def _blocks(tree: Tree, lattice: Grid) -> Iterator[tuple[Array, Array]]:
     edge = float(lattice.spacing_mm[0])
     # One more, which number -1 finds: no vessel.
     tiles = np.full((len(occupied) + 1, BLOCK, BLOCK, BLOCK), FAR * edge, np.float32)
-    place += flat[block] * BLOCK**3
+    place += ((flat - np.arange(len(flat))) * size)[block]
     np.minimum.at(tiles.reshape(-1), place, value)
-    # A vertex exactly on a lattice point would collapse triangles; nothing may be exactly 0.
+    # A vertex exactly on a lattice point would collapse triangles; nothing may be exactly 0. So
+    # marching cubes need not look for any.
     tiles[np.abs(tiles) < 1e-3 * edge] = 1e-3 * edge
     for corner in occupied:
         distance = np.empty((BLOCK + 1,) * 3, np.float32)
