@@ -51,7 +51,6 @@ class _Group(click.Group):
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
 def main(verbose: bool) -> None:
     """Simulate, evaluate and score coronary reconstructions."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as gcar does
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
 
