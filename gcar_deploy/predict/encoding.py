@@ -165,29 +165,19 @@ def _levels(index: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
 def _neighbours(index: Array) -> Array:
     """(n, 27) rows of ``index`` (unique, sorted) that touch each row; n where none does."""
     n = len(index)
-    span = index.max(axis=0) + 3 if n else np.ones(3, np.int64)
+    if not n:
+        return np.zeros((0, 27), np.int64)
+    low = index.min(axis=0) - 1
+    span = index.max(axis=0) + 2 - low
     stride = np.array([span[1] * span[2], span[2], 1])
-    keys = (index + 1) @ stride
-    out = np.full((n, 27), n, np.int64)
-    out[:, 13] = np.arange(n)
-    dense = n > 0 and int(np.prod(span)) <= MAX_TABLE
-    if dense:
-        place = np.full(int(np.prod(span)), n, np.int32)
-        place[keys] = np.arange(n)
-    for k in range(13):
-        # Offset k and its opposite 26 - k are found by one search.
-        wanted = keys + _OFFSETS[k] @ stride
-        if dense:
-            at = place[wanted]
-            here = np.flatnonzero(at < n)
-        else:
-            at = np.searchsorted(keys, wanted) if n else wanted
-            at[at == n] = 0
-            here = np.flatnonzero(keys[at] == wanted) if n else at
-        there = at[here]
-        out[here, k] = there
-        out[there, 26 - k] = here
-    return out
+    keys = (index - low) @ stride
+    wanted = keys[:, None] + _OFFSETS @ stride
+    if int(np.prod(span)) > MAX_TABLE:
+        at = np.minimum(np.searchsorted(keys, wanted), n - 1)
+        return np.where(keys[at] == wanted, at, n)
+    place = np.full(int(np.prod(span)), n, np.int32)
+    place[keys] = np.arange(n)
+    return place[wanted].astype(np.int64)
 
 
 def input_names() -> list[str]:

@@ -1,11 +1,14 @@
 """Neighbour tables, coarse levels and rays against slow, obvious twins."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcar_deploy.config import CandidateOptions
+from gcar_deploy.predict import encoding
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES, _levels, _neighbours, encode
 from gcar_deploy.predict.hull import visual_hull
 from gcar_deploy.predict.thinning import thin_hull
@@ -15,12 +18,13 @@ from tests.predict.test_hull import GRID, helix, scene
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(1, 60), st.integers(0, 10**6))
-def test_neighbours_equal_a_dictionary(n, seed):
+@given(st.integers(1, 60), st.integers(0, 10**6), st.booleans())
+def test_neighbours_equal_a_dictionary(n, seed, searched):
     rng = np.random.default_rng(seed)
     index = np.unique(rng.integers(0, 6, (n, 3)), axis=0)
     at = {tuple(i): k for k, i in enumerate(index)}
-    table = _neighbours(index)
+    with mock.patch.object(encoding, "MAX_TABLE", 0 if searched else encoding.MAX_TABLE):
+        table = _neighbours(index)
     for k, i in enumerate(index):
         wanted = [
             at.get((i[0] + x, i[1] + y, i[2] + z), len(index))
