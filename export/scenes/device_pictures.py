@@ -1,7 +1,7 @@
 """Pictures whose lines a network learns catheters, leads and wires from, ready for it.
 
 Of each four one is a frame of a generated run (``cine``), one a generated angiogram
-(``angiograms``), one a raw picture of a generated tree (``raw_pictures``), one a real angiogram
+(``angiograms``), one a raw picture of a generated tree (``raw_angiograms``), one a real angiogram
 with the vessels as an expert drew them, where there are any. Most get further devices
 (``drawn_devices``). All are whole pictures, as at run time: where a picture ends says where devices
 come from. What is kept of a picture are its lines, as the run time looks along them.
@@ -29,18 +29,14 @@ from gcar_export.scenes.augmented import Labelled, augmented_pair
 from gcar_export.scenes.cine import cine_pair
 from gcar_export.scenes.drawn_devices import drawn_devices as drawn
 from gcar_export.scenes.expert_pictures import ExpertPicture
-from gcar_export.scenes.protocols import clinical_geometry
-from gcar_export.scenes.raw_pictures import random_options, raw_picture
-from gcar_export.scenes.render import path_lengths
-from gcar_export.scenes.trees import any_style, random_tree
+from gcar_export.scenes.raw_angiograms import raw_angiogram
 
 #: enlargement of a picture that fills the network's field, and how far it is turned, degrees
 ZOOM, TURN_DEG = (1.0, 1.2), 8.0
 #: of the pictures this share gets further devices; what they absorb at least to be one
 FURTHER, SEEN = 0.6, 0.02
-#: a step between the numbers of patients, and of angiograms, of two seeds; angles of raw pictures
-#: vary by so much, degrees
-_SEED, _SPREAD_DEG = 31_000, 12.0
+#: a step between the numbers of patients, and of angiograms, of two seeds
+_SEED = 31_000
 #: what a point of a line is; of an expert's picture only what is no vessel is known
 VESSEL, DEVICE, OTHER, NO_VESSEL, NOT_ASKED = 0, 1, 2, 3, -1
 #: so near to a vessel, and to a device, nobody says which a line is, pixels to each side
@@ -74,8 +70,8 @@ def device_picture(
     elif kind == 0:
         pixels, vessel, device = _frame(rng, _SEED + seed, index)
     elif kind == 3:
-        pixels, vessel = _raw(rng)
-        device = np.zeros_like(vessel)
+        made = raw_angiogram(rng)
+        pixels, vessel, device = made.pixels, made.path_px > PERHAPS_PX, made.device
     else:
         made = generated_angiogram(_SEED + seed, index)
         pixels, vessel, device = made.pixels, made.path_px > PERHAPS_PX, made.device
@@ -94,15 +90,6 @@ def _frame(rng: np.random.Generator, seed: int, index: int) -> tuple[Array, Mask
     frame = int(np.argsort(filled)[-1 - int(rng.integers(2))])
     least = PERHAPS_PX * run.carm.pixel_at_isocenter_mm
     return run.pixels[frame], run.path_mm[frame] > least, run.device[frame]
-
-
-def _raw(rng: np.random.Generator) -> tuple[Array, Mask]:
-    """Pixels and vessel of a raw picture of a generated tree, of any contrast and display."""
-    tree = random_tree(rng, any_style(rng))
-    carm = clinical_geometry(2)[0][int(rng.integers(2))].turned(*(_SPREAD_DEG * rng.normal(size=2)))
-    path_mm = path_lengths(carm, *tree.segments())
-    pixels = raw_picture(path_mm, rng, random_options(rng))
-    return pixels, path_mm > PERHAPS_PX * carm.pixel_at_isocenter_mm
 
 
 def _looked_at(

@@ -1,4 +1,8 @@
-"""Generated angiograms that are drawn once, kept in a folder and used by every run."""
+"""Generated angiograms that are drawn once, kept in a folder and used by every run.
+
+Of each three one is a raw picture of a whole tree (``raw_angiograms``), two are drawn in the plane
+(``angiograms``).
+"""
 
 from __future__ import annotations
 
@@ -13,16 +17,27 @@ from gcar_export.scenes import (
     angiogram_scenery,
     angiogram_vessels,
     angiograms,
+    raw_angiograms,
     raw_pictures,
     render,
     trees,
 )
-from gcar_export.scenes.angiograms import asked_of, generated_angiogram
+from gcar_export.scenes.angiograms import GeneratedAngiogram, asked_of, generated_angiogram
 from gcar_export.scenes.augmented import Labelled
+from gcar_export.scenes.raw_angiograms import raw_angiogram
 
-#: enlargement of a crop
-ZOOM = (0.9, 1.3)
-_MAKERS = (angiogram_scenery, angiogram_vessels, angiograms, raw_pictures, render, trees)
+#: enlargement of a crop, and of a raw picture's, which is twice as fine
+ZOOM, RAW_ZOOM = (0.9, 1.3), (0.62, 1.0)
+RAW_EVERY = 3
+_MAKERS = (
+    angiogram_scenery,
+    angiogram_vessels,
+    angiograms,
+    raw_angiograms,
+    raw_pictures,
+    render,
+    trees,
+)
 
 
 @functools.cache
@@ -36,7 +51,7 @@ def pooled(folder: Path, seed: int, index: int) -> Labelled:
     """Picture ``index`` of the stream ``seed``; drawn where the folder does not hold it yet."""
     path = folder / f"{generator()}-{seed}-{index:06d}.npz"
     if not path.exists():
-        made = generated_angiogram(seed, index)
+        made = drawn(seed, index)
         folder.mkdir(parents=True, exist_ok=True)
         asked = asked_of(made).astype(np.float16)
         part = path.with_suffix(f".{os.getpid()}.tmp")
@@ -44,4 +59,12 @@ def pooled(folder: Path, seed: int, index: int) -> Labelled:
             np.savez_compressed(file, pixels=made.pixels, asked=asked)
         part.replace(path)
     with np.load(path) as data:
-        return Labelled(data["pixels"], data["asked"].astype(np.float32), ZOOM)
+        asked, fine = data["asked"].astype(np.float32), index % RAW_EVERY == 0
+        return Labelled(data["pixels"], asked, RAW_ZOOM if fine else ZOOM)
+
+
+def drawn(seed: int, index: int) -> GeneratedAngiogram:
+    """Picture ``index`` of the stream ``seed``, drawn anew."""
+    if index % RAW_EVERY:
+        return generated_angiogram(seed, index)
+    return raw_angiogram(np.random.default_rng([seed, index]))

@@ -35,6 +35,7 @@ from gcar_export.scenes.angiograms import (  # noqa: E402
 from gcar_export.scenes.augmented import Labelled, augmented_pair  # noqa: E402
 from gcar_export.scenes.expert_pictures import expert_pair, expert_pictures, folds  # noqa: E402
 from gcar_export.scenes.picture_pool import pooled  # noqa: E402
+from gcar_export.scenes.raw_angiograms import raw_angiogram  # noqa: E402
 from gcar_export.shipping.export_segmenter import _GroupNorm, export_segmenter  # noqa: E402
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig  # noqa: E402
 from gcar_export.training.segmenter import (  # noqa: E402
@@ -310,9 +311,9 @@ def test_a_step_holds_real_and_generated_pictures(drawn, tmp_path):
 
 
 def test_a_pooled_picture_is_drawn_once_and_never_used_twice_alike(tmp_path):
-    one = pooled(tmp_path, 5, 0)
-    again = pooled(tmp_path, 5, 0)
-    made = generated_angiogram(5, 0)
+    one = pooled(tmp_path, 5, 1)
+    again = pooled(tmp_path, 5, 1)
+    made = generated_angiogram(5, 1)
     for found in (one, again):
         np.testing.assert_array_equal(found.pixels, made.pixels)
         np.testing.assert_allclose(found.asked, asked_of(made), rtol=1e-3, atol=1e-4)
@@ -320,6 +321,23 @@ def test_a_pooled_picture_is_drawn_once_and_never_used_twice_alike(tmp_path):
     pairs = [augmented_pair(np.random.default_rng(k), one) for k in (0, 0, 1)]
     np.testing.assert_array_equal(pairs[0][0], pairs[1][0])
     assert (pairs[0][0] != pairs[2][0]).any()
+
+
+def test_of_three_pooled_pictures_one_shows_a_whole_tree(tmp_path):
+    """Its chords are millimetres of a coronary artery in pixels, its vessels dark."""
+    shown = [pooled(tmp_path, 5, k) for k in range(4)]
+    assert [p.pixels.shape[0] for p in shown] == [512, SIDE, SIDE, 512]
+    for whole in shown[::3]:
+        mask, weight, chord, device, known, line = whole.asked
+        pixel_mm = raw_angiogram(np.random.default_rng([5, 0])).pixel_mm
+        near = cv2.dilate(mask, np.ones((25, 25))) > 0
+        assert whole.pixels[mask > 0].mean() < whole.pixels[near & (chord == 0)].mean()
+        # A vessel of some 1 .. 5 mm is crossed at a slant, and where it turns along the beam.
+        assert 0.8 < np.median(chord[line > 0]) * pixel_mm < 5 and chord.max() * pixel_mm < 40
+        assert not device.any() and known[mask > 0].all() and (chord[mask > 0] > 0.8).all()
+        assert not weight[(chord > 0.25) & (cv2.dilate(mask, np.ones((3, 3))) == 0)].any()
+        # At the network's size its vessels are as wide as those of the pictures drawn in the plane.
+        assert 0.6 <= whole.zoom[0] < whole.zoom[1] <= 448 / 352
 
 
 def test_picture_and_truth_are_moved_alike():

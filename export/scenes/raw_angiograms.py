@@ -1,0 +1,38 @@
+"""Raw pictures of whole generated trees, as the segmenter's networks are trained on.
+
+``generated_angiogram`` draws vessels in the plane and devices over anatomy of its own; here a tree
+in space is seen by a clinical view, over ribs, spine and diaphragm, at any contrast and display.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gcar_export.scenes.angiograms import FAINT, PERHAPS_PX, SURE_PX, GeneratedAngiogram
+from gcar_export.scenes.protocols import clinical_geometry
+from gcar_export.scenes.raw_pictures import random_options, raw_picture
+from gcar_export.scenes.render import path_lengths
+from gcar_export.scenes.trees import any_style, random_tree
+
+#: standard deviation of each angle of a view, degrees
+SPREAD_DEG = 12.0
+
+
+def raw_angiogram(rng: np.random.Generator) -> GeneratedAngiogram:
+    """Draw one, (512, 512) pixels."""
+    tree = random_tree(rng, any_style(rng))
+    carm = clinical_geometry(2)[0][int(rng.integers(2))].turned(*(SPREAD_DEG * rng.normal(size=2)))
+    options = random_options(rng)
+    path_mm = path_lengths(carm, *tree.segments())
+    path_px = (path_mm / carm.pixel_at_isocenter_mm).astype(np.float32)
+    mask = (path_px > SURE_PX) & (options.contrast_per_mm * path_mm > FAINT)
+    rim = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return GeneratedAngiogram(
+        pixels=raw_picture(path_mm, rng, options),
+        mask=mask,
+        unsure=(path_px > PERHAPS_PX) & ~rim,
+        device=np.zeros_like(mask),
+        path_px=path_px,
+        pixel_mm=carm.pixel_at_isocenter_mm,
+    )
