@@ -225,13 +225,20 @@ def test_a_stated_alternative_is_shown_and_picked(serve, browse):
 
 
 @pytest.mark.slow
-def test_corrections_mend_a_raw_case(serve, engine):
-    """Two ends of vessels that view 1 lacks and a faint one, painted: DSC from 0.808 to 0.824."""
+@pytest.mark.parametrize(
+    ("segmenter", "gain", "least"), [("classic", 0.015, 0.78), ("auto", 0, 0.82)]
+)
+def test_corrections_mend_a_raw_case(serve, engine, segmenter, gain, least):
+    """Two ends of vessels that view 1 lacks and a faint one, painted.
+
+    DSC by the ridge filter alone from 0.765 to 0.796; the network finds the ends by itself.
+    """
     import nibabel
 
     folder = ready_case("R_0401")
     truth = np.asarray(nibabel.load(folder / "truth.nii.gz").dataobj) >= 0.5
-    given = Order(views=(folder / "view1.png", folder / "view2.png"), geometry=folder / "geom.json")
+    views = (folder / "view1.png", folder / "view2.png")
+    given = Order(views=views, geometry=folder / "geom.json", segmenter=segmenter)
     missed = [[[296, 137], [309, 146], [323, 155]], [[164, 179], [147, 192]],
               [[96, 254], [121, 233]]]  # fmt: skip
     strokes = [{"do": "paint", "width_px": 9, "points": points} for points in missed]
@@ -240,7 +247,7 @@ def test_corrections_mend_a_raw_case(serve, engine):
     for order in (given, corrected):
         made = engine.reconstruct_order(order).volume >= 0.5
         found.append(2 * (made & truth).sum() / (made.sum() + truth.sum()))
-    assert found[0] + 0.015 < found[1] and found[1] > 0.82, found
+    assert found[0] + gain < found[1] and found[1] > least, found
 
 
 @pytest.mark.slow
