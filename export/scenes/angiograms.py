@@ -81,7 +81,7 @@ def generated_angiogram(seed: int, index: int) -> GeneratedAngiogram:
     return GeneratedAngiogram(
         pixels=displayed(rng, light, field),
         mask=mask & field,
-        unsure=(path_px > PERHAPS_PX) & ~mask & ~_rim(mask) & field,
+        unsure=(path_px > PERHAPS_PX) & ~mask & ~rim(mask) & field,
         device=((contrast * pixel_mm * tube > DEVICE) | (devices > DEVICE))
         & (path_px <= PERHAPS_PX)
         & field,
@@ -90,7 +90,7 @@ def generated_angiogram(seed: int, index: int) -> GeneratedAngiogram:
     )
 
 
-def _rim(mask: Mask) -> Mask:
+def rim(mask: Mask) -> Mask:
     """Mask with what is so near to a sure vessel that it is the rim, which is not drawn."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
@@ -117,7 +117,7 @@ def _plain(
     return GeneratedAngiogram(
         pixels=np.clip(light, 0, 255).round().astype(np.uint8),
         mask=mask,
-        unsure=(path_px > PERHAPS_PX) & ~mask & ~_rim(mask),
+        unsure=(path_px > PERHAPS_PX) & ~mask & ~rim(mask),
         device=np.zeros_like(mask),
         path_px=path_px,
         pixel_mm=pixel_mm,

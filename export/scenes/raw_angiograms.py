@@ -6,10 +6,9 @@ in space is seen by a clinical view, over ribs, spine and diaphragm, at any cont
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
-from gcar_export.scenes.angiograms import FAINT, PERHAPS_PX, SURE_PX, GeneratedAngiogram
+from gcar_export.scenes.angiograms import FAINT, PERHAPS_PX, SURE_PX, GeneratedAngiogram, rim
 from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
@@ -27,11 +26,10 @@ def raw_angiogram(rng: np.random.Generator) -> GeneratedAngiogram:
     path_mm = path_lengths(carm, *tree.segments())
     path_px = (path_mm / carm.pixel_at_isocenter_mm).astype(np.float32)
     mask = (path_px > SURE_PX) & (options.contrast_per_mm * path_mm > FAINT)
-    rim = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return GeneratedAngiogram(
         pixels=raw_picture(path_mm, rng, options),
         mask=mask,
-        unsure=(path_px > PERHAPS_PX) & ~rim,
+        unsure=(path_px > PERHAPS_PX) & ~rim(mask),
         device=np.zeros_like(mask),
         path_px=path_px,
         pixel_mm=carm.pixel_at_isocenter_mm,

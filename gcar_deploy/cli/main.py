@@ -103,8 +103,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     verbose = "-v" in arguments or "--verbose" in arguments
     # All memory goes with the process: looking for cycles in it first takes 0.1 s.
     atexit.register(gc.freeze)
-    # Many small products: shared out, they cost several times their time where another program has
-    # a core, and last digits depend on the cores. Heeded only before numpy is imported.
+    # Many small products: shared out, they wait for each other where another program has a core,
+    # and last digits depend on the cores. Heeded only before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     previous = signal.signal(signal.SIGTERM, _terminate)
     try:

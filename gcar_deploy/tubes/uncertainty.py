@@ -34,7 +34,7 @@ from gcar_deploy.types import Array, Pixels, Points
 #: covariances are solved for every so many points and interpolated between.
 EVERY = 5
 #: ... so many right-hand sides at once: from eight on BLAS sends small products to its threads,
-#: which costs thirty times the products where another program has a core
+#: which costs far more than the products where another program has a core
 TOGETHER = 4
 #: a starting point errs as its neighbours do, and moves with the geometry it was found in: the
 #: starting points hold so many times less than the fit lets them

@@ -1,5 +1,6 @@
 """The loop that trainings share: what it minimises, keeps, passes over, and goes on from."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -58,10 +59,16 @@ def test_a_line_is_learned_and_its_mean_is_kept(tmp_path):
 
 
 def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
+    begun = []
     for name, pieces in (("one", [60]), ("two", [23, 60])):
         for steps in pieces:
             net = line()
-            learn(RunFolder(tmp_path / name, MANIFEST), net, options(), lesson(net, steps=steps))
+            own = lesson(net, steps=steps)
+            own = dataclasses.replace(
+                own, batches=lambda k, n=steps: begun.append(k) or range(k, n)
+            )
+            learn(RunFolder(tmp_path / name, MANIFEST), net, options(), own)
+    assert begun == [0, 0, 23]
     one, two = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys()
     for name, value in one.items():

@@ -340,6 +340,25 @@ def test_of_three_pooled_pictures_one_shows_a_whole_tree(tmp_path):
         assert 0.6 <= whole.zoom[0] < whole.zoom[1] <= 448 / 352
 
 
+def test_vessels_too_faint_to_be_drawn_are_asked_neither_way(monkeypatch):
+    """Were all faint, no pixel would be vessel for sure, and all that hold a chord unsure."""
+    monkeypatch.setattr("gcar_export.scenes.raw_angiograms.FAINT", 1e3)
+    made = raw_angiogram(np.random.default_rng([5, 0]))
+    assert not made.mask.any() and made.unsure.sum() > 1000
+    np.testing.assert_array_equal(made.unsure, made.path_px > 0.25)
+
+
+def test_chords_of_an_experts_vessel_are_longer_than_it_is_wide(tmp_path):
+    """A bar drawn 12 pixels wide: a round vessel's chord is its width, over what experts draw."""
+    mask = np.zeros((300, 300), np.uint8)
+    mask[140:152, 20:280] = 255
+    cv2.imwrite(str(tmp_path / "1_gt.png"), mask)
+    cv2.imwrite(str(tmp_path / "1.png"), 200 - mask // 2)
+    (one,) = expert_pictures(tmp_path)
+    assert one.path_px[143:149, 60:240].max() == pytest.approx(12 / 0.6, rel=0.08)
+    assert not one.path_px[:138].any()
+
+
 def test_picture_and_truth_are_moved_alike():
     """Of a disc the area grows with the square of the zoom, its chord with the zoom."""
     disc = np.hypot(*(np.indices((256, 256)) - 127.5)) < 30
