@@ -1,6 +1,6 @@
 """Generated angiograms that are drawn once, kept in a folder and used by every run.
 
-Of each three one is a raw picture of a whole tree (``raw_angiograms``), two are drawn in the plane
+Of each two one is a raw picture of a tree in space (``raw_angiograms``), one is drawn in the plane
 (``angiograms``).
 """
 
@@ -28,7 +28,7 @@ from gcar_export.scenes.raw_angiograms import raw_angiogram
 
 #: enlargement of a crop, and of a raw picture's, which is twice as fine
 ZOOM, RAW_ZOOM = (0.9, 1.3), (0.62, 1.0)
-RAW_EVERY = 3
+RAW_EVERY = 2
 _MAKERS = (
     angiogram_scenery,
     angiogram_vessels,
