@@ -1,5 +1,6 @@
 """The shipped segmentation network: loads, finds a drawn tree, and what it adds to the other."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -8,6 +9,7 @@ from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.imaging.extract import bright_vessels, extract_vessels
 from gcar_deploy.imaging.fusion import fused
 from gcar_deploy.imaging.net import load_segmenter
+from gcar_deploy.imaging.skeleton import skeletonize
 from tests.conftest import data_dir
 from tests.imaging.phantoms import angiogram, raw_picture, tube_paths
 
@@ -53,6 +55,46 @@ def test_the_fusion_draws_what_the_network_draws_and_forgets_no_line(net):
     # The scale is the network's.
     of_both = both.path_mm[two.mask].sum() / two.path_mm[two.mask].sum()
     assert of_both == pytest.approx(1, abs=0.15)
+
+
+def artery_over_ribs(contrast, slope, pixel_mm):
+    """(512, 512) grey counts and chords, mm: an artery with three branches over faint ribs."""
+    rng = np.random.default_rng(3)
+    v, u = np.indices((512, 512)) / 512
+    path = np.zeros((512, 512))
+
+    def draw(course, radii):
+        nonlocal path
+        for (x, y), radius in zip(course, radii, strict=True):
+            away = np.hypot(u - x, v - y) * 512 * pixel_mm
+            path = np.maximum(path, 2 * np.sqrt(np.clip(radius**2 - away**2, 0, None)))
+
+    t = np.linspace(0, 1, 300)[:, None]
+    main = np.hstack([0.30 + 0.22 * np.sin(2.6 * t), 0.16 + 0.66 * t])
+    draw(main, 1.6 - 0.9 * t[:, 0])
+    for k, (right, down) in ((90, (-0.20, 0.16)), (150, (0.22, 0.10)), (220, (0.16, 0.18))):
+        draw(main[k] + np.hstack([right * t, down * t + 0.03 * np.sin(9 * t)]), 0.8 - 0.4 * t[:, 0])
+    soft = cv2.GaussianBlur(rng.standard_normal((512, 512)), (0, 0), 40)
+    ribs = np.zeros((512, 512))
+    for start in np.arange(-0.4, 1.4, 0.3):
+        off = np.abs(v - start - slope * u - 0.15 * (u - 0.5) ** 2) / 0.03
+        ribs += np.exp(-((off - 1) ** 2) / 0.15) + 0.4 * (off < 1)
+    light = np.exp(-contrast * path - 0.08 * soft / soft.std() - 0.03 * ribs)
+    seen = cv2.GaussianBlur(rng.poisson(2500 * light) / 2500, (0, 0), 0.8)
+    return np.clip(255 * seen / np.quantile(seen, 0.999), 0, 255), path
+
+
+@pytest.mark.parametrize("slope", [-0.4, 0.25])
+@pytest.mark.parametrize("contrast", [0.10, 0.15])
+def test_ribs_are_no_vessels_where_there_is_little_vessel(net, contrast, slope):
+    """They are longer than all vessels then, and as strong as the thin ones."""
+    grey, path = artery_over_ribs(contrast, slope, 0.27)
+    found = extract_vessels(angiogram(grey, pixel_mm=0.27), ImagingOptions(), net)
+    true = path > 0.1
+    near = cv2.dilate(true.astype(np.uint8), np.ones((9, 9))) > 0
+    line, reach = skeletonize(true), cv2.dilate(found.mask.astype(np.uint8), np.ones((7, 7))) > 0
+    assert (found.skeleton & ~near).sum() < 0.1 * line.sum()
+    assert reach[line].mean() > 0.95
 
 
 def test_a_blank_picture_is_refused_by_both(net):
