@@ -44,7 +44,7 @@ CONTRAST_SHARE = 0.1
 _ALONG_PX, _BLUR_PX = 3.0, 0.7
 #: a line of one picture alone is left out where it is so probably no vessel, as long as no more
 #: than this share of all lines goes
-DEVICE_LEVEL, DEVICE_SHARE = 0.9, 0.8
+DEVICE_LEVEL, DEVICE_SHARE = 0.95, 0.8
 
 
 def learned_vessels(
