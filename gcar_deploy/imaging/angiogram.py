@@ -45,6 +45,8 @@ class Angiogram:
         Which frame of a run it is, where the program chose it.
     bare : tuple of (rows, cols) float32
         Frames of the same run before contrast came; what is a line there is no vessel.
+    file : str
+        Name of the file that it was read from; empty for an array.
     """
 
     view_id: str
@@ -59,6 +61,7 @@ class Angiogram:
     painted: Mask | None = None
     frame: ChosenFrame | None = None
     bare: tuple[Image, ...] = ()
+    file: str = ""
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)
@@ -133,6 +136,8 @@ class VesselImage:
         Probability of catheter, lead or wire; None where no network was asked.
     by_network : bool
         Whether the network's word is in it.
+    kept : VesselImage or None
+        The same with nothing taken for a device, where something was.
     """
 
     view_id: str
@@ -149,6 +154,7 @@ class VesselImage:
     device: Image | None = None
     by_network: bool = False
     others: tuple[VesselImage, ...] = ()
+    kept: VesselImage | None = None
 
     def __post_init__(self) -> None:
         arrays = (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter, self.device)

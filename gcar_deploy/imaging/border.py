@@ -93,6 +93,7 @@ def put_back(found: VesselImage, angiogram: Angiogram, box: Box) -> VesselImage:
         catheter=None if found.catheter is None else whole(found.catheter),
         device=None if found.device is None else whole(found.device),
         others=tuple(put_back(other, angiogram, box) for other in found.others),
+        kept=found.kept and put_back(found.kept, angiogram, box),
     )
 
 

@@ -54,4 +54,5 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
         skeleton=line,
         path_mm=np.asarray(path, dtype=np.float32),
         others=tuple(edited(other, angiogram) for other in found.others),
+        kept=found.kept and edited(found.kept, angiogram),
     )

@@ -175,8 +175,9 @@ def _needed(segmenter: Segmenter | None) -> Segmenter:
 
 
 def _nothing(angiogram: Angiogram, reason: str) -> RefusedError:
+    file = f" ({angiogram.file})" if angiogram.file else ""
     return RefusedError(
-        f"no vessel found in view {angiogram.view_id}: {reason}; "
+        f"no vessel found in view {angiogram.view_id}{file}: {reason}; "
         "check the picture and its intensity kind and polarity"
     )
 
@@ -253,6 +254,7 @@ def by_width(view: VesselImage) -> VesselImage:
         path_error=MASK_ERROR,
         kind="mask",
         others=(),
+        kept=None,
     )
 
 
@@ -297,11 +299,11 @@ def _from_grey(
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     pictures, holes = grey
     search = pictures.get("search", next(iter(pictures.values())))
-    path_mm, path_error = None, CHORD_ERROR
+    path_mm, path_error, kept = None, CHORD_ERROR, None
     if angiogram.mask is not None:
         found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm)
     elif segmenter is not None:
-        found, path_mm = learned_vessels(pictures, holes, pixel_mm, segmenter)
+        (found, path_mm), kept = learned_vessels(pictures, holes, pixel_mm, segmenter)
     else:
         found = segment.segment(search, holes, pixel_mm, pictures.get("came"))
     if found.catheter_mm > 0:
@@ -323,7 +325,7 @@ def _from_grey(
     if path_mm is None:
         path_mm = _contrast_path(angiogram, pictures, found)
         path_error = CONTRAST_ERROR
-    return VesselImage(
+    view = VesselImage(
         view_id=angiogram.view_id,
         carm=angiogram.carm,
         path_mm=path_mm,
@@ -338,6 +340,13 @@ def _from_grey(
         device=found.device,
         by_network=segmenter is not None and angiogram.mask is None,
     )
+    if kept is None:
+        return view
+    more, path_mm = kept
+    return dataclasses.replace(view, kept=dataclasses.replace(
+        view, path_mm=path_mm, mask=more.mask, skeleton=more.skeleton, catheter=None,
+        catheter_mm=0.0,
+    ))  # fmt: skip
 
 
 def _contrast_path(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -45,6 +46,8 @@ _ALONG_PX, _BLUR_PX = 3.0, 0.7
 #: a line of one picture alone is left out where it is so probably no vessel, as long as no more
 #: than this share of all lines goes
 DEVICE_LEVEL, DEVICE_SHARE = 0.95, 0.8
+#: what is vessel, and how deep
+Found: TypeAlias = tuple[segment.Segmentation, Image]
 
 
 def learned_vessels(
@@ -52,7 +55,7 @@ def learned_vessels(
     holes: Mask,
     pixel_mm: float,
     segmenter: Segmenter,
-) -> tuple[segment.Segmentation, Image]:
+) -> tuple[Found, Found | None]:
     """Find bright vessels and how deep they are.
 
     Parameters
@@ -66,11 +69,12 @@ def learned_vessels(
 
     Returns
     -------
-    found : Segmentation, at the picture's own size
+    found : Segmentation, at the picture's own size, and (rows, cols) float32
         The mask ends at a share of the path in the middle; its ``vesselness`` is the network's
-        probability. Where vessels are does not depend on ``pixel_mm``.
-    path_mm : (rows, cols) float32
-        Length of the ray within vessel, 0 away from vessels; it reaches beyond the mask.
+        probability. Where vessels are does not depend on ``pixel_mm``. Length of the ray within
+        vessel, mm, 0 away from vessels; it reaches beyond the mask.
+    kept : the same with nothing taken for a device; None where nothing was, or where frames before
+        contrast say what is one
     """
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
@@ -83,10 +87,25 @@ def learned_vessels(
         came = segment.resize(pictures["came"], work.shape[::-1]) > 0.5
         new = skel.beside(reach, line, skel.mostly(line, came))
         device, told = device & ~new, np.where(new, np.float32(0), told)
+
+    def drawn(device: Mask) -> Found:
+        return _found(pictures, holes, pixel_mm, seen, work_holes, device, told)
+
+    none = np.zeros_like(device)
+    asks = device.any() and "came" not in pictures
+    return drawn(device), drawn(none) if asks else None
+
+
+def _found(
+    pictures: Mapping[str, Image], holes: Mask, pixel_mm: float, seen: Seen, work_holes: Mask,
+    device: Mask, told: Image,
+) -> Found:  # fmt: skip
+    """Draw what is seen, without holes and devices; see ``learned_vessels``."""
+    search = pictures.get("search", next(iter(pictures.values())))
     other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]
-    finer = float(np.sqrt(search.size / work.size))
+    finer = float(np.sqrt(search.size / device.size))
     work_mm = np.float32(pixel_mm * finer)
     sure = support(seen, LEVELS)
     near = (segment.resize(sure.astype(np.float32), full) >= 0.5) & ~holes
@@ -96,7 +115,7 @@ def learned_vessels(
     path = np.where(near, contrast, np.float32(0))
     # A rim is best seen by both: chords end where an observer draws it, contrast is fine.
     mask = _drawn(np.where(near, 0.5 * (chord + contrast), np.float32(0)), near, finer)
-    device &= ~sure
+    device = device & ~sure
     found = dataclasses.replace(
         segment.given(search, mask, holes, pixel_mm),
         vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),

@@ -43,6 +43,7 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     return dataclasses.replace(
         old,
         others=(),
+        kept=None,
         carm=old.carm.resized(rows, columns),
         path_mm=path,
         mask=mask,

@@ -28,6 +28,8 @@ BORDER_MM = 4.0
 SPUR_MM, SHORTEST_MM, LONGEST_MM = 6.0, 8.0, 160.0
 #: a line goes on through a fork where it turns by no more than this over so much of its way
 THROUGH_DEG, _WAY_MM = 25.0, 4.0
+#: a line that comes back reaches so much further, pixels to each side
+_END = np.ones((9, 9), np.uint8)
 
 
 def stray_lines(view: VesselImage) -> Iterator[Mask]:
@@ -83,6 +85,34 @@ def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:
     return dataclasses.replace(
         view, others=(), mask=mask, skeleton=skel.skeletonize(mask), catheter=device,
         path_mm=np.where(gone, np.float32(0), view.path_mm),
+    )  # fmt: skip
+
+
+def given_back(view: VesselImage) -> Iterator[VesselImage]:
+    """Yield the view with one of the lines that were taken for a device, the longest first."""
+    kept = view.kept
+    if kept is None or view.catheter is None:
+        return
+    _, label, stats, _ = cv2.connectedComponentsWithStats(
+        (kept.skeleton & view.catheter).astype(np.uint8), connectivity=8
+    )
+    size = stats[:, cv2.CC_STAT_AREA]
+    size[0] = 0
+    least = SHORTEST_MM / view.carm.pixel_at_isocenter_mm
+    for k in np.argsort(-size, kind="stable")[: int((size >= least).sum())]:
+        yield _with_line(view, kept, label == k)
+
+
+def _with_line(view: VesselImage, kept: VesselImage, line: Mask) -> VesselImage:
+    """Return the view with a part of another's skeleton and what lies along it."""
+    # Where it was cut off from the tree, its end went as well.
+    longer = cv2.dilate(line.astype(np.uint8), _END) > 0
+    back = skel.beside(kept.path_mm > 0, kept.skeleton, longer & kept.skeleton)
+    mask = view.mask | (kept.mask & back)
+    return dataclasses.replace(
+        view, others=(), mask=mask, skeleton=skel.skeletonize(mask),
+        catheter=None if view.catheter is None else view.catheter & ~back,
+        path_mm=np.where(back & (view.path_mm <= 0), kept.path_mm, view.path_mm),
     )  # fmt: skip
 
 

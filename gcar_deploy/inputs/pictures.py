@@ -71,6 +71,10 @@ def prepare(
         angiograms, grid, notes = _in_memory(views), geometry, []
     else:
         angiograms, grid, notes = _by_scene(views, _scene(geometry), options)
+    angiograms = [
+        dataclasses.replace(one, file=Path(view).name) if isinstance(view, (str, Path)) else one
+        for one, view in zip(angiograms, views, strict=True)
+    ]
     masks = masks or {}
     angiograms = with_masks(angiograms, masks, options.imaging.limits)
     notes += [f"view {k}: the vessel mask is the user's" for k in masks]

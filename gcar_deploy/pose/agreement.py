@@ -35,7 +35,8 @@ def agreeing(
     """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
 
     First from what one method sees of all views, where the other followed lines that have no
-    counterpart; then without lines that no other view shows (``partners``). Where they contradict
+    counterpart; then without lines that no other view shows, and with those that were taken for
+    devices and that another view shows (``partners``). Where they contradict
     each other still, the same from any reading of either view, and then from widths alone. Nothing
     of a mask that the user gave is left out.
 
@@ -43,7 +44,8 @@ def agreeing(
     -------
     views : as given, or a reading of them, or without some of their lines
     poses : one per view
-    findings : that lines were left out, or depth is told by widths: the result is ``degraded``
+    findings : that lines were left out or came back, or depth is told by widths: the result is
+        ``degraded``
     """
     asked = [
         not (view.calibrated or view.kind == "mask" or angiogram.mask is not None)
@@ -63,18 +65,27 @@ def agreeing(
             break
         fewer, closer = partnered(seen, poses, asked, limits.parts_disagreement_raw, estimate)
         if max(p.after for p in closer) <= limits.good_disagreement_raw:
-            return fewer, closer, _left_out(fewer, seen)
+            return fewer, closer, _changed(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.
     return _by_width(views, asked, options) or (list(seen), poses, [])
 
 
-def _left_out(fewer: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[str]:
-    return [
-        f"view {one.view_id}: {1 - one.mask.sum() / view.mask.sum():.0%} of what looks like vessel "
-        "has no counterpart in the other views: left out as catheter, lead or background"
-        for one, view in zip(fewer, views, strict=True)
-        if one is not view
-    ]
+def _changed(now: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[str]:
+    """Say what was left out of the views, and what came back that was taken for a device."""
+    said = []
+    for one, view in zip(now, views, strict=True):
+        less, more = (view.mask & ~one.mask).sum(), (one.mask & ~view.mask).sum()
+        if less:
+            said.append(
+                f"view {one.view_id}: {less / view.mask.sum():.0%} of what looks like vessel has "
+                "no counterpart in the other views: left out as catheter, lead or background"
+            )
+        if more:
+            said.append(
+                f"view {one.view_id}: {more / one.mask.sum():.0%} of the vessels look like a "
+                "catheter or lead; they are kept, because the other views show them as well"
+            )
+    return said
 
 
 def _by_width(

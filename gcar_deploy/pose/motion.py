@@ -97,6 +97,7 @@ class Motion:
         return dataclasses.replace(
             view,
             others=(),
+            kept=None,
             path_mm=path,
             mask=mask,
             skeleton=skel.skeletonize(mask),

@@ -4,7 +4,8 @@ Two views of one tree hold the same vessel mass in every epipolar plane. A line 
 shows breaks that. So of the lines that may be no vessel (``imaging.stray_lines``) those are left
 out, one after the other, without which the views agree far better. What the network takes for a
 device goes already where they agree a little better; so do two of them, one in each view, since a
-catheter that both show agrees as vessels do.
+catheter that both show agrees as vessels do. A line that was taken for a device in one picture
+comes back where the views agree far better with it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.imaging.stray_lines import likely_devices, stray_lines, without_line
+from gcar_deploy.imaging.stray_lines import given_back, likely_devices, stray_lines, without_line
 from gcar_deploy.pose.pairwise import Pose
 
 #: each line that is left out lowers the disagreement to this share at least
@@ -35,6 +36,8 @@ def partnered(
 ) -> tuple[list[VesselImage], tuple[Pose, ...]]:  # fmt: skip
     """Leave out likely devices, and lines that no other view shows until the views agree enough.
 
+    Until then lines that were taken for devices come back, too, where these agree far better.
+
     Parameters
     ----------
     views : V vessel images
@@ -48,6 +51,7 @@ def partnered(
     views, poses : those that are not changed are the same objects
     """
     now = list(views)
+    more_of = functools.cache(lambda view: list(given_back(view))[:MOST_LINES])
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
     fewer_of = functools.cache(_fewer)  # few views change from round to round
     while True:
@@ -61,6 +65,8 @@ def partnered(
         if worst > enough:
             others = [[one for one, device in some if not device] for some in fewer]
             tried += [(each, GAIN) for each in _one_of(now, others)]
+            more = [more_of(view) if may else [] for view, may in zip(now, asked, strict=True)]
+            tried += [(each, GAIN) for each in _one_of(now, more)]
         if not tried:
             break
         found = [estimate(each) for each, _ in tried]

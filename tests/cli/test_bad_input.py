@@ -195,10 +195,10 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     ),
     # 6: no tree can honestly be made
     "blank view": (picture(np.zeros_like), 6, "no vessel"),
-    "constant view": (picture(lambda p: np.full_like(p, 500)), 6, "no vessel"),
+    "constant view": (picture(lambda p: np.full_like(p, 500)), 6, "view 2 (view2.png)"),
     "saturated view": (picture(lambda p: np.maximum(p, 60000)), 6, "no vessel"),
     "empty mask": (mask(np.zeros_like), 6, "no vessel"),
-    "full mask": (mask(nearly_full), 6, "nearly every pixel"),
+    "full mask": (mask(nearly_full), 6, "(view2.png): nearly every pixel"),
     "mask of one pixel": (mask(speckle), 6, "mm of line"),
     "both views the same picture": (same_picture, 6, "same picture"),
     "3 degrees apart": (

@@ -69,6 +69,17 @@ def test_a_catheter_that_the_network_knows_leaves_the_classical_path():
     assert (both.path_mm[vessel & away] > 0).all()
 
 
+def test_what_either_takes_for_a_device_is_remembered():
+    shaft, vessel = drawn(SHAFT), drawn(VESSEL)
+    none = np.zeros_like(shaft)
+    whole = seen(shaft | vessel, none)
+    learned = dataclasses.replace(seen(vessel, shaft & ~vessel), kept=whole)
+    both = fused(whole, learned, picture(shaft, vessel))
+    assert not both.mask[20, 30] and both.kept.mask[20, 30]
+    assert both.kept.path_mm[20, 30] == pytest.approx(2, rel=0.1)
+    assert fused(whole, seen(vessel, none), picture(shaft, vessel)).kept is None
+
+
 def test_paths_are_read_from_contrast_wherever_either_sees_a_vessel():
     vessel, branch = drawn(VESSEL), drawn(SHAFT)
     none = np.zeros_like(vessel)

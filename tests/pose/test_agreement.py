@@ -90,6 +90,48 @@ def test_a_line_through_the_tree_without_counterpart_is_left_out_and_said():
     assert (kept[0].mask & ~tree).sum() < 0.1 * (views[0].mask & ~tree).sum()
 
 
+def without(view, gone):
+    """A view of which a part was taken for a device."""
+    mask = view.mask & ~gone
+    return dataclasses.replace(
+        view, mask=mask, skeleton=skeletonize(mask), kept=view, catheter=view.mask & gone,
+        path_mm=np.where(mask, view.path_mm, np.float32(0)),
+    )  # fmt: skip
+
+
+def lower_half(view):
+    """The part of a view below its vessels' middle row."""
+    rows = np.arange(view.mask.shape[0])[:, None]
+    return np.broadcast_to(rows > np.average(np.flatnonzero(view.mask.any(axis=1))),
+                           view.mask.shape)  # fmt: skip
+
+
+def test_what_was_taken_for_a_device_comes_back_where_the_other_view_shows_it():
+    angiograms, (one, two) = pair()
+    lost = without(one, lower_half(one))
+    assert poses_between([lost, two], OPTIONS)[1].after > 0.12
+    kept, poses, findings = agreeing(angiograms, [lost, two], OPTIONS)
+    assert poses[1].after < 0.05 and kept[1] is two
+    back = kept[0].mask & lost.catheter
+    assert back.sum() > 0.6 * lost.catheter.sum()
+    assert not (kept[0].catheter & kept[0].mask).any()
+    assert (kept[0].path_mm[back] == one.path_mm[back]).all()
+    assert len(findings) == 1 and "look like a catheter" in findings[0]
+    # Where nobody remembers what it was, the views differ.
+    forgotten = dataclasses.replace(lost, kept=None)
+    assert agreeing(angiograms, [forgotten, two], OPTIONS)[1][1].after > 0.12
+
+
+def test_a_device_that_one_view_shows_stays_away_where_a_vessel_comes_back():
+    angiograms, (crossed, two) = pair(stranger="crossing")
+    tree = pair()[1][0]
+    lost = without(crossed, lower_half(crossed) | ~tree.mask)
+    kept, poses, _ = agreeing(angiograms, [lost, two], OPTIONS)
+    assert poses[1].after < 0.12
+    assert (kept[0].mask & tree.mask).sum() > 0.85 * tree.mask.sum()
+    assert (kept[0].mask & ~tree.mask).sum() < 0.1 * (crossed.mask & ~tree.mask).sum()
+
+
 def test_views_that_agree_are_left_as_they_are():
     angiograms, views = pair()
     kept, _, findings = agreeing(angiograms, views, OPTIONS)
