@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from gcar_deploy.errors import ImageError
@@ -136,8 +137,8 @@ class VesselImage:
         Probability of catheter, lead or wire; None where no network was asked.
     by_network : bool
         Whether the network's word is in it.
-    kept : VesselImage or None
-        The same with nothing taken for a device, where something was.
+    kept : callable or None
+        Gives the same with nothing taken for a device, where something was: few pairs ask.
     """
 
     view_id: str
@@ -154,7 +155,7 @@ class VesselImage:
     device: Image | None = None
     by_network: bool = False
     others: tuple[VesselImage, ...] = ()
-    kept: VesselImage | None = None
+    kept: Callable[[], VesselImage] | None = None
 
     def __post_init__(self) -> None:
         arrays = (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter, self.device)

@@ -76,7 +76,7 @@ def cut_out(angiogram: Angiogram, box: Box) -> Angiogram:
 def put_back(found: VesselImage, angiogram: Angiogram, box: Box) -> VesselImage:
     """Return what was found within a box as a vessel image of the whole picture."""
     top, bottom, left, right = box
-    shape = angiogram.pixels.shape
+    shape, kept = angiogram.pixels.shape, found.kept
     room = (top, shape[0] - bottom), (left, shape[1] - right)
 
     def whole(array: Array) -> Array:
@@ -93,7 +93,7 @@ def put_back(found: VesselImage, angiogram: Angiogram, box: Box) -> VesselImage:
         catheter=None if found.catheter is None else whole(found.catheter),
         device=None if found.device is None else whole(found.device),
         others=tuple(put_back(other, angiogram, box) for other in found.others),
-        kept=found.kept and put_back(found.kept, angiogram, box),
+        kept=None if kept is None else lambda: put_back(kept(), angiogram, box),
     )
 
 

@@ -29,7 +29,7 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
     RefusedError
         Nothing is left.
     """
-    erased, painted = angiogram.erased, angiogram.painted
+    erased, painted, kept = angiogram.erased, angiogram.painted, found.kept
     if erased is None and painted is None:
         return found
     nowhere = np.zeros(found.mask.shape, bool)
@@ -54,5 +54,5 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
         skeleton=line,
         path_mm=np.asarray(path, dtype=np.float32),
         others=tuple(edited(other, angiogram) for other in found.others),
-        kept=found.kept and edited(found.kept, angiogram),
+        kept=None if kept is None else lambda: edited(kept(), angiogram),
     )

@@ -340,13 +340,15 @@ def _from_grey(
         device=found.device,
         by_network=segmenter is not None and angiogram.mask is None,
     )
-    if kept is None:
-        return view
-    more, path_mm = kept
-    return dataclasses.replace(view, kept=dataclasses.replace(
-        view, path_mm=path_mm, mask=more.mask, skeleton=more.skeleton, catheter=None,
+    return view if kept is None else dataclasses.replace(view, kept=lambda: _whole(view, *kept()))
+
+
+def _whole(view: VesselImage, found: segment.Segmentation, path_mm: Image) -> VesselImage:
+    """Return the view with what was found where nothing is taken for a device."""
+    return dataclasses.replace(
+        view, path_mm=path_mm, mask=found.mask, skeleton=found.skeleton, catheter=None,
         catheter_mm=0.0,
-    ))  # fmt: skip
+    )  # fmt: skip
 
 
 def _contrast_path(

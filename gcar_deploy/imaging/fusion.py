@@ -35,7 +35,7 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
     VesselImage ; its ``others`` are ``learned`` and ``classic``, and where these hold lines that
     stand out on one side alone, all three without them
     """
-    whole = None if learned.kept is None else _both(classic, learned.kept, picture)
+    kept, whole = learned.kept, classic
     classic, learned = (
         without_lines(classic, learned.catheter),
         without_lines(learned, classic.catheter),
@@ -49,7 +49,10 @@ def fused(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
     less = tuple(without_lines(view, rim) for view, rim in zip(others, rims, strict=True))
     if any(a is not b for a, b in zip(less, others, strict=True)):
         others += (_both(less[1], less[0], picture), *less)
-    return dataclasses.replace(_both(classic, learned, picture), others=others, kept=whole)
+    return dataclasses.replace(
+        _both(classic, learned, picture), others=others,
+        kept=None if kept is None else lambda: _both(whole, kept(), picture),
+    )  # fmt: skip
 
 
 def _both(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselImage:

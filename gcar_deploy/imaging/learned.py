@@ -9,7 +9,7 @@ the scale of paths. Masks are drawn by the mean of both.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import cv2
@@ -55,7 +55,7 @@ def learned_vessels(
     holes: Mask,
     pixel_mm: float,
     segmenter: Segmenter,
-) -> tuple[Found, Found | None]:
+) -> tuple[Found, Callable[[], Found] | None]:
     """Find bright vessels and how deep they are.
 
     Parameters
@@ -73,8 +73,8 @@ def learned_vessels(
         The mask ends at a share of the path in the middle; its ``vesselness`` is the network's
         probability. Where vessels are does not depend on ``pixel_mm``. Length of the ray within
         vessel, mm, 0 away from vessels; it reaches beyond the mask.
-    kept : the same with nothing taken for a device; None where nothing was, or where frames before
-        contrast say what is one
+    kept : gives the same with nothing taken for a device; None where nothing was, or where frames
+        before contrast say what is one
     """
     search = pictures.get("search", next(iter(pictures.values())))
     work, work_holes = at_network_size(search, holes)
@@ -91,9 +91,8 @@ def learned_vessels(
     def drawn(device: Mask) -> Found:
         return _found(pictures, holes, pixel_mm, seen, work_holes, device, told)
 
-    none = np.zeros_like(device)
     asks = device.any() and "came" not in pictures
-    return drawn(device), drawn(none) if asks else None
+    return drawn(device), (lambda: drawn(np.zeros_like(device))) if asks else None
 
 
 def _found(

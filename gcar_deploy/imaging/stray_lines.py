@@ -88,31 +88,27 @@ def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:
     )  # fmt: skip
 
 
-def given_back(view: VesselImage) -> Iterator[VesselImage]:
-    """Yield the view with one of the lines that were taken for a device, the longest first."""
-    kept = view.kept
-    if kept is None or view.catheter is None:
+def lost_lines(view: VesselImage, whole: VesselImage) -> Iterator[Mask]:
+    """Yield (rows, cols) bool parts of the whole view's skeleton that were taken for a device."""
+    if view.catheter is None:
         return
-    _, label, stats, _ = cv2.connectedComponentsWithStats(
-        (kept.skeleton & view.catheter).astype(np.uint8), connectivity=8
-    )
-    size = stats[:, cv2.CC_STAT_AREA]
-    size[0] = 0
+    line = whole.skeleton & view.catheter
+    count, label = cv2.connectedComponents(line.astype(np.uint8), connectivity=8)
+    size = np.bincount(label[line], minlength=count)
     least = SHORTEST_MM / view.carm.pixel_at_isocenter_mm
-    for k in np.argsort(-size, kind="stable")[: int((size >= least).sum())]:
-        yield _with_line(view, kept, label == k)
+    yield from (label == k for k in range(1, count) if size[k] >= least)
 
 
-def _with_line(view: VesselImage, kept: VesselImage, line: Mask) -> VesselImage:
-    """Return the view with a part of another's skeleton and what lies along it."""
+def with_line(view: VesselImage, whole: VesselImage, lost: Mask) -> VesselImage:
+    """Return the view with a part of the whole one's skeleton and what lies along it."""
     # Where it was cut off from the tree, its end went as well.
-    longer = cv2.dilate(line.astype(np.uint8), _END) > 0
-    back = skel.beside(kept.path_mm > 0, kept.skeleton, longer & kept.skeleton)
-    mask = view.mask | (kept.mask & back)
+    longer = cv2.dilate(lost.astype(np.uint8), _END) > 0
+    back = skel.beside(whole.path_mm > 0, whole.skeleton, longer & whole.skeleton)
+    mask = view.mask | (whole.mask & back)
     return dataclasses.replace(
         view, others=(), mask=mask, skeleton=skel.skeletonize(mask),
         catheter=None if view.catheter is None else view.catheter & ~back,
-        path_mm=np.where(back & (view.path_mm <= 0), kept.path_mm, view.path_mm),
+        path_mm=np.where(back & (view.path_mm <= 0), whole.path_mm, view.path_mm),
     )  # fmt: skip
 
 

@@ -11,12 +11,19 @@ comes back where the views agree far better with it.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.imaging.stray_lines import given_back, likely_devices, stray_lines, without_line
+from gcar_deploy.imaging.stray_lines import (
+    likely_devices,
+    lost_lines,
+    stray_lines,
+    with_line,
+    without_line,
+)
 from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.types import Mask
 
 #: each line that is left out lowers the disagreement to this share at least
 GAIN = 0.85
@@ -51,9 +58,9 @@ def partnered(
     views, poses : those that are not changed are the same objects
     """
     now = list(views)
-    more_of = functools.cache(lambda view: list(given_back(view))[:MOST_LINES])
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
-    fewer_of = functools.cache(_fewer)  # few views change from round to round
+    # Few views change from round to round.
+    fewer_of, more_of = functools.cache(_fewer), functools.cache(_more)
     while True:
         worst = max(pose.after for pose in poses)
         fewer = [
@@ -65,7 +72,7 @@ def partnered(
         if worst > enough:
             others = [[one for one, device in some if not device] for some in fewer]
             tried += [(each, GAIN) for each in _one_of(now, others)]
-            more = [more_of(view) if may else [] for view, may in zip(now, asked, strict=True)]
+            more = [more_of(view) if may else () for view, may in zip(now, asked, strict=True)]
             tried += [(each, GAIN) for each in _one_of(now, more)]
         if not tried:
             break
@@ -97,7 +104,7 @@ def _two_of(views: Views, instead: Sequence[Views]) -> Iterator[list[VesselImage
 
 def _fewer(view: VesselImage, least_px: float) -> list[tuple[VesselImage, bool]]:
     """Return the view without one of its lines, and if that is a likely device, for each."""
-    lines = sorted(stray_lines(view), key=lambda line: -int(line.sum()))[:MOST_LINES]
+    lines = _longest(stray_lines(view))
     lines += list(likely_devices(view, INSIDE))
     found = []
     for line in lines:
@@ -106,3 +113,15 @@ def _fewer(view: VesselImage, least_px: float) -> list[tuple[VesselImage, bool]]
             said = 0.0 if view.device is None else float(view.device[line].mean())
             found.append((left, said >= LIKELY))
     return found
+
+
+def _more(view: VesselImage) -> list[VesselImage]:
+    """Return the view with one of the lines that were taken for a device, for each."""
+    if view.kept is None:
+        return []
+    whole = view.kept()
+    return [with_line(view, whole, line) for line in _longest(lost_lines(view, whole))]
+
+
+def _longest(lines: Iterable[Mask]) -> list[Mask]:
+    return sorted(lines, key=lambda line: -int(line.sum()))[:MOST_LINES]

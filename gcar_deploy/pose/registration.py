@@ -123,12 +123,17 @@ def register(
         refusal = str(error)
     by_width = any(new.kind != old.kind for new, old in zip(views, given, strict=True))
     return Registered(
-        views=tuple(posed(view, pose) for view, pose in zip(views, poses, strict=True)),
+        views=tuple(_placed(view, pose) for view, pose in zip(views, poses, strict=True)),
         poses=poses,
         findings=tuple(findings),
         hint=hint,
         refusal=refusal or (_two_contradictions(poses) if by_width else ""),
     )
+
+
+def _placed(view: VesselImage, pose: Pose) -> VesselImage:
+    """Build the correction in; nobody asks any more what was taken for a device."""
+    return posed(view if view.kept is None else dataclasses.replace(view, kept=None), pose)
 
 
 def _two_contradictions(poses: Sequence[Pose]) -> str:

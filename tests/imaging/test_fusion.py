@@ -73,10 +73,10 @@ def test_what_either_takes_for_a_device_is_remembered():
     shaft, vessel = drawn(SHAFT), drawn(VESSEL)
     none = np.zeros_like(shaft)
     whole = seen(shaft | vessel, none)
-    learned = dataclasses.replace(seen(vessel, shaft & ~vessel), kept=whole)
+    learned = dataclasses.replace(seen(vessel, shaft & ~vessel), kept=lambda: whole)
     both = fused(whole, learned, picture(shaft, vessel))
-    assert not both.mask[20, 30] and both.kept.mask[20, 30]
-    assert both.kept.path_mm[20, 30] == pytest.approx(2, rel=0.1)
+    assert not both.mask[20, 30] and both.kept().mask[20, 30]
+    assert both.kept().path_mm[20, 30] == pytest.approx(2, rel=0.1)
     assert fused(whole, seen(vessel, none), picture(shaft, vessel)).kept is None
 
 

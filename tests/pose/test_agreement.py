@@ -94,7 +94,7 @@ def without(view, gone):
     """A view of which a part was taken for a device."""
     mask = view.mask & ~gone
     return dataclasses.replace(
-        view, mask=mask, skeleton=skeletonize(mask), kept=view, catheter=view.mask & gone,
+        view, mask=mask, skeleton=skeletonize(mask), kept=lambda: view, catheter=view.mask & gone,
         path_mm=np.where(mask, view.path_mm, np.float32(0)),
     )  # fmt: skip
 
