@@ -90,9 +90,7 @@ def without_line(view: VesselImage, stray: Mask) -> VesselImage | None:
 
 def lost_lines(view: VesselImage, whole: VesselImage) -> Iterator[Mask]:
     """Yield (rows, cols) bool parts of the whole view's skeleton that were taken for a device."""
-    if view.catheter is None:
-        return
-    line = whole.skeleton & view.catheter
+    line = _lost(view, whole)
     count, label = cv2.connectedComponents(line.astype(np.uint8), connectivity=8)
     size = np.bincount(label[line], minlength=count)
     least = SHORTEST_MM / view.carm.pixel_at_isocenter_mm
@@ -104,12 +102,19 @@ def with_line(view: VesselImage, whole: VesselImage, lost: Mask) -> VesselImage:
     # Where it was cut off from the tree, its end went as well.
     longer = cv2.dilate(lost.astype(np.uint8), _END) > 0
     back = skel.beside(whole.path_mm > 0, whole.skeleton, longer & whole.skeleton)
-    mask = view.mask | (whole.mask & back)
+    mask, device = view.mask | (whole.mask & back), view.catheter
+    if device is not None:
+        device = device & ~mask & ~skel.beside_alone(device, _lost(view, whole), lost)
     return dataclasses.replace(
-        view, others=(), mask=mask, skeleton=skel.skeletonize(mask),
-        catheter=None if view.catheter is None else view.catheter & ~back,
+        view, others=(), mask=mask, skeleton=skel.skeletonize(mask), catheter=device,
         path_mm=np.where(back & (view.path_mm <= 0), whole.path_mm, view.path_mm),
     )  # fmt: skip
+
+
+def _lost(view: VesselImage, whole: VesselImage) -> Mask:
+    if view.catheter is None:
+        return np.zeros_like(view.mask)
+    return whole.skeleton & view.catheter
 
 
 def _straight_on(graph: LineGraph, path: list[Pixel], px: float) -> list[Pixel]:

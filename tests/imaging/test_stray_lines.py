@@ -9,7 +9,7 @@ import pytest
 
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.skeleton import skeletonize
-from gcar_deploy.imaging.stray_lines import stray_lines, without_line
+from gcar_deploy.imaging.stray_lines import lost_lines, stray_lines, with_line, without_line
 from gcar_deploy.types import Mask
 from tests.imaging.phantoms import PIXEL_MM, carm
 
@@ -84,3 +84,21 @@ def test_what_goes_on_from_a_device_that_was_left_out_is_asked() -> None:
     assert list(stray_lines(dataclasses.replace(view, catheter=elsewhere))) == []
     line = next(stray_lines(dataclasses.replace(view, catheter=beyond)))
     assert covers(line, BRANCH) > 0.9 and not line[:100].any()
+
+
+def test_a_line_that_comes_back_leaves_nothing_of_its_device() -> None:
+    """Two lines were taken for devices, wider than they are; one comes back."""
+    whole = view_of(VESSEL, BRANCH, APART)
+    view = view_of((VESSEL[0], VESSEL[1]))
+    device = np.zeros((SIDE, SIDE), bool)
+    for rows, columns in (BRANCH, APART):
+        device[rows.start - 3 : rows.stop + 3, columns] = True
+    view = dataclasses.replace(view, catheter=device & ~view.mask)
+    apart, branch = sorted(lost_lines(view, whole), key=np.sum)
+    assert covers(branch, BRANCH) > 0.8 and covers(apart, APART) > 0.7
+    assert not (branch & view.mask).any()
+    back = with_line(view, whole, branch)
+    assert back.mask[BRANCH].all() and not back.mask[APART].any()
+    assert back.path_mm[BRANCH].all() and not back.path_mm[APART].any()
+    assert back.catheter is not None and back.catheter[APART].all()
+    assert not back.catheter[: APART[0].start - 3].any()

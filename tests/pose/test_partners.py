@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gcar_deploy.imaging.stray_lines import without_line
 from gcar_deploy.pose.partners import LIKELY, partnered
 from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, view_of
 
@@ -73,3 +74,23 @@ def test_what_both_views_call_a_device_goes_if_without_both_they_agree_better(sa
     """A catheter that both show: without it in one of them alone, they agree less."""
     found = asked(said, lambda one, two: AGREED * (2 if one != two else 1 if one else 0.9))
     assert found == [kept, kept]
+
+
+@pytest.mark.parametrize(
+    ("before", "share", "back"),
+    [(2 * ENOUGH, 0.5, True), (2 * ENOUGH, 0.95, False), (AGREED, 0.5, False)],
+)
+def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before, share, back):
+    whole = crossed(0.0)
+    lost = without_line(view_of(VESSEL, CROSSING), view_of(CROSSING).skeleton)
+    views = [dataclasses.replace(lost, kept=lambda: whole), crossed(0.0)]
+    assert not there(views[0]) and there(whole)
+
+    def estimate(tried):
+        return poses(share * before if there(tried[0]) else before)
+
+    kept, found = partnered(views, estimate(views), (True, False), ENOUGH, estimate)
+    assert there(kept[0]) == back and kept[1] is views[1]
+    assert found[1].after == (share * before if back else before)
+    # A picture whose mask the user gave is left alone.
+    assert partnered(views, estimate(views), (False, False), ENOUGH, estimate)[0][0] is views[0]
