@@ -104,7 +104,8 @@ def with_line(view: VesselImage, whole: VesselImage, lost: Mask) -> VesselImage:
     back = skel.beside(whole.path_mm > 0, whole.skeleton, longer & whole.skeleton)
     mask, device = view.mask | (whole.mask & back), view.catheter
     if device is not None:
-        device = device & ~mask & ~skel.beside_alone(device, _lost(view, whole), lost)
+        own = skel.beside_alone(skel.parts_touching(device, lost), _lost(view, whole), lost)
+        device = device & ~mask & ~own
     return dataclasses.replace(
         view, others=(), mask=mask, skeleton=skel.skeletonize(mask), catheter=device,
         path_mm=np.where(back & (view.path_mm <= 0), whole.path_mm, view.path_mm),

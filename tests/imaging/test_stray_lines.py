@@ -93,6 +93,7 @@ def test_a_line_that_comes_back_leaves_nothing_of_its_device() -> None:
     device = np.zeros((SIDE, SIDE), bool)
     for rows, columns in (BRANCH, APART):
         device[rows.start - 3 : rows.stop + 3, columns] = True
+    device[20:24, 200:204] = True  # a speck that is no line
     view = dataclasses.replace(view, catheter=device & ~view.mask)
     apart, branch = sorted(lost_lines(view, whole), key=np.sum)
     assert covers(branch, BRANCH) > 0.8 and covers(apart, APART) > 0.7
@@ -101,4 +102,5 @@ def test_a_line_that_comes_back_leaves_nothing_of_its_device() -> None:
     assert back.mask[BRANCH].all() and not back.mask[APART].any()
     assert back.path_mm[BRANCH].all() and not back.path_mm[APART].any()
     assert back.catheter is not None and back.catheter[APART].all()
-    assert not back.catheter[: APART[0].start - 3].any()
+    assert back.catheter[20:24, 200:204].all()
+    assert not back.catheter[24 : APART[0].start - 3].any()
