@@ -127,6 +127,7 @@ def _reconstructed(
     with watch.stage("refine") as report:
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(),
+            None if centers.evidence is None else centers.evidence.points,
         ).or_fail()  # fmt: skip
         signals = [
             read_signal(a, v)

@@ -6,11 +6,15 @@ import dataclasses
 
 import numpy as np
 
+from gcar_deploy.tree.curves import resample
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Array
+from gcar_deploy.types import Array, Points
 
 #: what every point of a branch has, whatever is known of it
 _PER_POINT = ("points_mm", "radius_mm", "sigma_mm", "confidence")
+
+#: points of a new branch are so far apart, mm
+NEW_STEP_MM = 1.0
 
 
 def kept_branches(tree: Tree, keep: Array) -> Tree:
@@ -69,6 +73,50 @@ def merged(tree: Tree) -> Tree:
     left = [dataclasses.replace(b, start=number[b.start], end=number[b.end]) for b in left]
     nodes = tree.nodes_mm[np.array(used, dtype=np.int64)] if used else np.zeros((0, 3))
     return Tree(nodes_mm=nodes, branches=tuple(left))
+
+
+def with_branch(
+    tree: Tree, points_mm: Points, radius_mm: float, confidence: float, within_mm: float
+) -> Tree:
+    """Add a branch; where it begins near the tree it is joined to it.
+
+    Parameters
+    ----------
+    tree : Tree
+    points_mm : (m, 3) places along the new branch, m >= 2; it is drawn in steps of some mm
+    radius_mm, confidence : of all its points
+    within_mm : most distance of its first place from a centreline that it leaves
+
+    Returns
+    -------
+    Tree
+        The branch that is left is cut in two there, unless it ends there.
+    """
+    nodes, branches = list(tree.nodes_mm), list(tree.branches)
+    start = len(nodes)
+    gaps = [np.linalg.norm(branch.points_mm - points_mm[0], axis=1) for branch in branches]
+    nearest = int(np.argmin([gap.min() for gap in gaps])) if gaps else 0
+    if gaps and gaps[nearest].min() <= within_mm:
+        branch, at = branches[nearest], int(gaps[nearest].argmin())
+        if at in (0, len(branch) - 1):
+            start = branch.end if at else branch.start
+        else:
+            nodes.append(branch.points_mm[at])
+            branches[nearest] = dataclasses.replace(part_of(branch, 0, at), end=start)
+            rest = part_of(branch, at, len(branch) - 1)
+            branches.append(dataclasses.replace(rest, start=start))
+        # The first place gives way to the node, so that no step is next to nothing.
+        points_mm = np.concatenate([nodes[start][None], points_mm[1:]])
+    else:
+        nodes.append(points_mm[0])
+    line = resample(points_mm, NEW_STEP_MM)
+    same = np.ones(len(line))
+    new = Branch(
+        points_mm=line, radius_mm=radius_mm * same, sigma_mm=np.nan * same,
+        confidence=confidence * same, start=start, end=len(nodes),
+    )  # fmt: skip
+    nodes.append(line[-1])
+    return merged(Tree(nodes_mm=np.array(nodes), branches=(*branches, new)))
 
 
 def reversed_branch(branch: Branch) -> Branch:

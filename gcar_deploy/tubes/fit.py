@@ -1,8 +1,12 @@
-"""The default refiner: settle the points, build the tree, fit it, cut and grow, state sigma."""
+"""The default refiner: settle the points, build the tree, fit it, cut and grow, look again.
+
+Last of all it states sigma.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import heapq
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -28,6 +32,7 @@ from gcar_deploy.tubes.gauss_newton import (
     rescaled,
 )
 from gcar_deploy.tubes.hessian import seen_by
+from gcar_deploy.tubes.missed import looked_at, missed_lines, proposal
 from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
 from gcar_deploy.tubes.prior import TAPER_PIXEL_MM, Prior, make_prior
 from gcar_deploy.tubes.radius_refit import refit_radii
@@ -36,6 +41,9 @@ from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, un
 from gcar_deploy.tubes.targets import Target, make_targets
 from gcar_deploy.tubes.uncertainty import spread
 from gcar_deploy.types import Array, Scalars
+
+#: a vessel that was missed is kept where it lowers the objective by this share
+EARNED = 0.005
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,6 +76,7 @@ def fit_tubes(
     views: Sequence[VesselImage],
     options: TubeOptions,
     should_stop: Callable[[], bool] | None = None,
+    evidence: CenterPoints | None = None,
 ) -> TubeFit:
     """Fit a tube tree to the pictures from starting points.
 
@@ -77,6 +86,8 @@ def fit_tubes(
     views : sequence of VesselImage, one or more
     options : TubeOptions
     should_stop : callable, asked before each step; True ends the fit with the best so far
+    evidence : what the predictor said of each candidate before any was chosen; without it no vessel
+        is looked for that the points miss
     """
     progress = Progress()
     settled_centers, scatter = settled(
@@ -93,7 +104,11 @@ def fit_tubes(
         contrast=(1.0,) * len(views),
         progress=progress,
     )
-    return _fitted(fit, views, _Run(options, progress, should_stop)) if tree.branches else fit
+    return (
+        _fitted(fit, views, _Run(options, progress, should_stop, evidence))
+        if tree.branches
+        else fit
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,6 +118,7 @@ class _Run:
     options: TubeOptions
     progress: Progress
     should_stop: Callable[[], bool] | None
+    evidence: CenterPoints | None
 
     def fit(self, tree: Tree, targets: list[Target], steps: int) -> _State:
         """Fit from where the tree is now."""
@@ -152,6 +168,7 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     if not now.tree.branches:
         return dataclasses.replace(start, tree=now.tree, contrast=contrast)
     if not (options.levels_mm[-1] or progress.stopped or progress.failed):
+        now = _with_missed(now, views, targets, run)
         now = _with_refitted_radii(now, targets, options)
     targets = rescaled(targets, now.prints)
     own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
@@ -166,6 +183,46 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
         if own and not options.levels_mm[-1]
         else (),
     )
+
+
+def _with_missed(
+    now: _State, views: Sequence[VesselImage], targets: list[Target], run: _Run
+) -> _State:
+    """Add the lines that no tube explains, the likeliest first, each where it earns its place."""
+    evidence = run.evidence
+    if evidence is None or len(views) < 2:
+        return now
+    looks = looked_at(views, rescaled(targets, now.prints), now.prints)
+    lines = missed_lines(looks)
+    # Costs are of the tree as it was when they were found: what is taken out is asked once more.
+    queue = [(0.0, number) for number in range(len(lines))]
+    least: float | None = None
+    while queue:
+        _, number = heapq.heappop(queue)
+        found = proposal(lines[number], looks, now.tree, evidence)
+        if found is None:
+            continue
+        if queue and found.cost > queue[0][0]:
+            heapq.heappush(queue, (found.cost, number))
+            continue
+        if least is None:
+            # What it must beat has had as many steps, from as near a start.
+            least = _tried(now.tree, targets, run)[1].losses[-1]
+        trial, progress = _tried(found.added(now.tree), targets, run)
+        if progress.stopped or progress.failed:
+            run.progress.stopped = True
+            break
+        if progress.losses[-1] < (1 - EARNED) * least:
+            now, least = trial, progress.losses[-1]
+            run.progress.follow(progress)
+            looks = looked_at(views, rescaled(targets, now.prints), now.prints)
+    return now
+
+
+def _tried(tree: Tree, targets: list[Target], run: _Run) -> tuple[_State, Progress]:
+    """Fit at the last level without a trace in what the run has done so far."""
+    aside = dataclasses.replace(run, progress=Progress())
+    return aside.fit(tree, targets, run.options.steps[-1]), aside.progress
 
 
 def _with_refitted_radii(now: _State, targets: list[Target], options: TubeOptions) -> _State:

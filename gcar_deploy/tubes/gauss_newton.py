@@ -84,6 +84,13 @@ class Progress:
     failed: bool = False
     ending: Ending | None = None
 
+    def follow(self, later: Progress) -> None:
+        """Add what a fit did that went on from here."""
+        self.losses += later.losses
+        self.steps += later.steps
+        self.rejected += later.rejected
+        self.ending = later.ending
+
 
 def fit_level(
     tubes: Tubes,

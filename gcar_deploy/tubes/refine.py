@@ -139,6 +139,7 @@ def refine(
     options: RefineOptions | None = None,
     on_progress: OnProgress | None = None,
     budget: Budget | None = None,
+    evidence: CenterPoints | None = None,
 ) -> Refined:
     """Refine starting points so that the model's projections explain every view.
 
@@ -149,6 +150,7 @@ def refine(
     options : RefineOptions; ``refiner`` picks the method
     on_progress : called with the share done, 0 .. 1
     budget : Budget; all the time where left out
+    evidence : as of ``fit_tubes``
 
     Raises
     ------
@@ -174,7 +176,7 @@ def refine(
         if options.refiner == "none":
             return start
         return _paper(start, placed, views, options, on_progress, budget.should_stop)
-    fit = fit_tubes(centers, views, options.tube, budget.should_stop)
+    fit = fit_tubes(centers, views, options.tube, budget.should_stop, evidence)
     if on_progress is not None:
         on_progress(1.0)
     status = "ok" if fit.tree.branches else "empty"
