@@ -42,8 +42,10 @@ from gcar_deploy.tubes.targets import Target, make_targets
 from gcar_deploy.tubes.uncertainty import spread
 from gcar_deploy.types import Array, Scalars
 
-#: a vessel that was missed is kept where it lowers the objective by this share
+#: a vessel that was missed is kept where it lowers the objective by this share ...
 EARNED = 0.005
+#: ... and, where paths are estimates and a line may be background, by so much per mm of it
+EARNED_PER_MM = 0.3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -212,7 +214,10 @@ def _with_missed(
         if progress.stopped or progress.failed:
             run.progress.stopped = True
             break
-        if progress.losses[-1] < (1 - EARNED) * least:
+        price = EARNED * least
+        if not all(target.calibrated for target in targets):
+            price = max(price, EARNED_PER_MM * (trial.tree.length_mm - now.tree.length_mm))
+        if progress.losses[-1] < least - price:
             now, least = trial, progress.losses[-1]
             run.progress.follow(progress)
             looks = looked_at(views, rescaled(targets, now.prints), now.prints)

@@ -107,6 +107,18 @@ def test_what_lowers_the_objective_too_little_is_left_out(monkeypatch):
     assert cKDTree(found.tree.points()).query(line[-1])[0] > 5.0
 
 
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_where_paths_are_estimates_each_mm_has_a_price(calibrated, monkeypatch):
+    truth, known, line = _with_twig()
+    where = grid(64)
+    views = _pictures(truth, two_views(), calibrated=calibrated)
+    monkeypatch.setattr("gcar_deploy.tubes.fit.EARNED_PER_MM", 100.0)
+    found = fit_tubes(
+        points_of(known, where), views, OPTIONS, evidence=_believed(truth, where, 0.3)
+    )
+    assert (cKDTree(found.tree.points()).query(line[-1])[0] < 2.0) == calibrated
+
+
 def test_an_end_without_time_keeps_what_there_is():
     truth, known, line = _with_twig()
     views = _pictures(truth, two_views())
