@@ -31,6 +31,8 @@ from gcar_deploy.types import Array, Image, Mask, Pixels, Points
 MISSED_SHARE, MIN_LENGTH_MM = 0.5, 6.0
 #: ... with holes up to this long; it is followed beyond its ends, to where it leaves the tree, mm
 HOLE_MM, BEYOND_MM = 2.0, 6.0
+#: a line that is a catheter, lead or wire with this mean probability is none
+MOST_DEVICE = 0.2
 #: paths are compared as means over this box, and tubes reach so much farther: fits are off by that
 BOX_MM, NEAR_MM = 1.0, 0.7
 #: path of no vessel, mm
@@ -167,14 +169,15 @@ def _lines(number: int, look: Look) -> list[MissedLine]:
     width: Image = 2 * cv2.distanceTransform(
         look.view.mask.astype(np.uint8), cv2.DIST_L2, 5
     ).astype(np.float32, copy=False)
-    beyond = round(BEYOND_MM / px)
+    beyond, device = round(BEYOND_MM / px), look.view.device
     out = []
     for chain in chains(line, width):
         at = np.array(chain)
         open_ = np.pad(missed[at[:, 0], at[:, 1]], 2 * hole)
         open_ = ndimage.binary_closing(open_, iterations=hole)[2 * hole : -2 * hole]
         for (run,) in ndimage.find_objects(ndimage.label(open_)[0]):
-            if run.stop - run.start < least:
+            row, col = at[run].T
+            if len(row) < least or (device is not None and device[row, col].mean() > MOST_DEVICE):
                 continue
             first, last = max(run.start - beyond, 0), min(run.stop + beyond, len(at))
             pixels = at[first:last, ::-1].astype(np.float64)

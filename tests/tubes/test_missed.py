@@ -107,6 +107,20 @@ def test_what_lowers_the_objective_too_little_is_left_out(monkeypatch):
     assert cKDTree(found.tree.points()).query(line[-1])[0] > 5.0
 
 
+@pytest.mark.parametrize(("probability", "is_vessel"), [(0.1, True), (0.4, False)])
+def test_a_likely_catheter_is_no_vessel(probability, is_vessel):
+    truth, known, line = _with_twig()
+    where = grid(64)
+    views = [
+        dataclasses.replace(view, device=np.full(view.mask.shape, probability, np.float32))
+        for view in _pictures(truth, two_views())
+    ]
+    found = fit_tubes(
+        points_of(known, where), views, OPTIONS, evidence=_believed(truth, where, 0.3)
+    )
+    assert (cKDTree(found.tree.points()).query(line[-1])[0] < 2.0) == is_vessel
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_where_paths_are_estimates_each_mm_has_a_price(calibrated, monkeypatch):
     truth, known, line = _with_twig()
