@@ -12,7 +12,6 @@ from gcar_deploy.types import Array, Points
 
 #: what every point of a branch has, whatever is known of it
 _PER_POINT = ("points_mm", "radius_mm", "sigma_mm", "confidence")
-
 #: points of a new branch are so far apart, mm
 NEW_STEP_MM = 1.0
 
@@ -36,14 +35,13 @@ def without_branch_at(tree: Tree, place_mm: Array, within_mm: float) -> Tree | N
     -------
     Tree, joined where two branches are left at a node, or None
     """
-    gaps = [np.linalg.norm(branch.points_mm - place_mm, axis=1) for branch in tree.branches]
-    if not gaps:
+    nearest = _nearest(tree, place_mm)
+    if nearest is None:
         return None
-    nearest = int(np.argmin([gap.min() for gap in gaps]))
-    at = int(gaps[nearest].argmin())
-    if gaps[nearest][at] > max(within_mm, float(tree.branches[nearest].radius_mm[at])):
+    number, at, gap = nearest
+    if gap > max(within_mm, float(tree.branches[number].radius_mm[at])):
         return None
-    return kept_branches(tree, np.arange(len(tree.branches)) != nearest)
+    return kept_branches(tree, np.arange(len(tree.branches)) != number)
 
 
 def merged(tree: Tree) -> Tree:
@@ -94,15 +92,15 @@ def with_branch(
     """
     nodes, branches = list(tree.nodes_mm), list(tree.branches)
     start = len(nodes)
-    gaps = [np.linalg.norm(branch.points_mm - points_mm[0], axis=1) for branch in branches]
-    nearest = int(np.argmin([gap.min() for gap in gaps])) if gaps else 0
-    if gaps and gaps[nearest].min() <= within_mm:
-        branch, at = branches[nearest], int(gaps[nearest].argmin())
+    nearest = _nearest(tree, points_mm[0])
+    if nearest is not None and nearest[2] <= within_mm:
+        number, at, _ = nearest
+        branch = branches[number]
         if at in (0, len(branch) - 1):
             start = branch.end if at else branch.start
         else:
             nodes.append(branch.points_mm[at])
-            branches[nearest] = dataclasses.replace(part_of(branch, 0, at), end=start)
+            branches[number] = dataclasses.replace(part_of(branch, 0, at), end=start)
             rest = part_of(branch, at, len(branch) - 1)
             branches.append(dataclasses.replace(rest, start=start))
         # The first place gives way to the node, so that no step is next to nothing.
@@ -142,6 +140,16 @@ def with_ends_moved(tree: Tree) -> Tree:
             if degrees[node] == 1:
                 nodes[node] = point
     return dataclasses.replace(tree, nodes_mm=nodes)
+
+
+def _nearest(tree: Tree, place_mm: Array) -> tuple[int, int, float] | None:
+    """Branch that passes nearest to a (3,) place, its point there, and the gap."""
+    gaps = [np.linalg.norm(branch.points_mm - place_mm, axis=1) for branch in tree.branches]
+    if not gaps:
+        return None
+    number = int(np.argmin([gap.min() for gap in gaps]))
+    at = int(gaps[number].argmin())
+    return number, at, float(gaps[number][at])
 
 
 def _points_of(branch: Branch, cut: slice) -> Branch:

@@ -36,18 +36,19 @@ def cheapest_course(
     total : float
     """
     places, depths = cost.shape
-    slopes = np.arange(-MOST_SLOPE, MOST_SLOPE + 1)
-    rise = slopes * depth_step / place_step
+    slopes = range(-MOST_SLOPE, MOST_SLOPE + 1)
+    numbers = np.arange(len(slopes))
+    rise = np.array(slopes) * depth_step / place_step
     angle, longer = np.arctan(rise), np.sqrt(1.0 + rise * rise)
     turns = 0.5 * (angle[:, None] - angle) ** 2 / (turn * turn * place_step)
-    turns[np.abs(slopes[:, None] - slopes) > MOST_CHANGE] = math.inf
+    turns[np.abs(numbers[:, None] - numbers) > MOST_CHANGE] = math.inf
     # Any slope is as good as another to begin with.
     value = np.repeat((cost[0] + start)[:, None], len(slopes), axis=1)
     before: list[Array] = []
     for place in range(1, places):
         reached = np.full_like(value, math.inf)
         came = np.zeros(value.shape, np.int64)
-        for number, slope in enumerate(range(-MOST_SLOPE, MOST_SLOPE + 1)):
+        for number, slope in enumerate(slopes):
             lowest = max(number - MOST_CHANGE, 0)
             near = slice(lowest, number + MOST_CHANGE + 1)
             ways = value[:, near] + turns[near, number]
@@ -64,8 +65,6 @@ def cheapest_course(
     total = float(value[depth, number])
     course = [depth]
     for came in reversed(before):
-        earlier = int(came[depth, number])
-        depth -= int(slopes[number])
-        number = earlier
+        depth, number = depth - slopes[number], int(came[depth, number])
         course.append(depth)
     return np.array(course[::-1]), total

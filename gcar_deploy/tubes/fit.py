@@ -32,7 +32,7 @@ from gcar_deploy.tubes.gauss_newton import (
     rescaled,
 )
 from gcar_deploy.tubes.hessian import seen_by
-from gcar_deploy.tubes.missed import looked_at, missed_lines, proposal
+from gcar_deploy.tubes.missed import Proposal, Told, looked_at, missed_lines, proposal
 from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
 from gcar_deploy.tubes.prior import TAPER_PIXEL_MM, Prior, make_prior
 from gcar_deploy.tubes.radius_refit import refit_radii
@@ -106,11 +106,9 @@ def fit_tubes(
         contrast=(1.0,) * len(views),
         progress=progress,
     )
-    return (
-        _fitted(fit, views, _Run(options, progress, should_stop, evidence))
-        if tree.branches
-        else fit
-    )
+    if not tree.branches:
+        return fit
+    return _fitted(fit, views, _Run(options, progress, should_stop, evidence))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,27 +189,30 @@ def _with_missed(
     now: _State, views: Sequence[VesselImage], targets: list[Target], run: _Run
 ) -> _State:
     """Add the lines that no tube explains, the likeliest first, each where it earns its place."""
-    evidence = run.evidence
-    if evidence is None or len(views) < 2:
+    if run.evidence is None or len(views) < 2:
         return now
     looks = looked_at(views, rescaled(targets, now.prints), now.prints)
     lines = missed_lines(looks)
-    # Costs are of the tree as it was when they were found: what is taken out is asked once more.
-    queue = [(0.0, number) for number in range(len(lines))]
+    if not lines:
+        return now
+    told = Told.by(run.evidence)
+    # Costs are of the tree as it was when they were found: of a later one they are asked once more.
+    queue: list[tuple[float, int, Proposal | None, _State | None]] = [
+        (-np.inf, number, None, None) for number in range(len(lines))
+    ]
     least: float | None = None
     while queue:
-        _, number = heapq.heappop(queue)
-        found = proposal(lines[number], looks, now.tree, evidence)
-        if found is None:
-            continue
-        if queue and found.cost > queue[0][0]:
-            heapq.heappush(queue, (found.cost, number))
+        _, number, found, of = heapq.heappop(queue)
+        if found is None or of is not now:
+            found = proposal(lines[number], looks, now.tree, told)
+            if found is not None:
+                heapq.heappush(queue, (found.cost, number, found, now))
             continue
         if least is None:
             # What it must beat has had as many steps, from as near a start.
             least = _tried(now.tree, targets, run)[1].losses[-1]
         trial, progress = _tried(found.added(now.tree), targets, run)
-        if progress.stopped or progress.failed:
+        if progress.stopped:
             run.progress.stopped = True
             break
         price = EARNED * least

@@ -10,6 +10,7 @@ which bends slowly. The cheapest course is a proposal: the fit says whether it e
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import cv2
@@ -24,8 +25,9 @@ from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import Tree, along, polyline_arc
 from gcar_deploy.tubes.course import cheapest_course
 from gcar_deploy.tubes.model import Footprint
+from gcar_deploy.tubes.support import sampled
 from gcar_deploy.tubes.targets import Target
-from gcar_deploy.types import Array, Image, Mask, Pixels, Points
+from gcar_deploy.types import Array, Image, Pixels, Points, Scalars
 
 #: a line counts where tubes leave this share of its path, over so many mm at the isocentre ...
 MISSED_SHARE, MIN_LENGTH_MM = 0.5, 6.0
@@ -72,20 +74,39 @@ class Look:
     seen_mm: Image
     left_mm: Image
 
-    @property
-    def pixel_mm(self) -> float:
-        """Edge of a pixel at the isocentre."""
-        return self.target.pixel_mm
+    @functools.cached_property
+    def missed(self) -> Array:
+        """(rows, cols) share of the path that no tube explains."""
+        return self.left_mm / np.maximum(self.seen_mm, np.float32(LEAST_PATH_MM))
 
-    def at(self, points_mm: Points) -> tuple[Array, Array]:
-        """``seen_mm`` and ``left_mm`` where (..., 3) points are projected to, 0 outside."""
-        pixels, depth = self.target.carm.project(points_mm.reshape(-1, 3))
-        place = np.where(depth[:, None] > 1.0, pixels, -10.0).T[::-1]
-        seen, left = (
-            ndimage.map_coordinates(picture, place, order=1).reshape(points_mm.shape[:-1])
-            for picture in (self.seen_mm, self.left_mm)
-        )
-        return seen, left
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Told:
+    """What the predictor said of each candidate before any was chosen, to be asked at any place.
+
+    Attributes
+    ----------
+    lookup : cKDTree of the n candidates
+    share : (n + 1,) root of their confidence, and 0 for a place without a candidate
+    reach_mm : a candidate speaks for places so near
+    """
+
+    lookup: cKDTree
+    share: Scalars
+    reach_mm: float
+
+    @staticmethod
+    def by(evidence: CenterPoints) -> Told:
+        """Prepare the evidence for questions."""
+        share = np.append(np.sqrt(evidence.confidence), 0.0)
+        return Told(cKDTree(evidence.points_mm), share, evidence.spacing_mm)
+
+    def at(self, points_mm: Points) -> Scalars:
+        """(n,) share told at (n, 3) points."""
+        # What finds no candidate gets the number behind the last.
+        _, near = self.lookup.query(points_mm, distance_upper_bound=self.reach_mm)
+        said: Scalars = self.share[near]
+        return said
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -152,15 +173,10 @@ def missed_lines(looks: Sequence[Look]) -> list[MissedLine]:
     return [line for number, look in enumerate(looks) for line in _lines(number, look)]
 
 
-def _missed(look: Look) -> Mask:
-    missed: Mask = look.left_mm > MISSED_SHARE * np.maximum(look.seen_mm, LEAST_PATH_MM)
-    return missed
-
-
 def _lines(number: int, look: Look) -> list[MissedLine]:
-    line, px = look.view.skeleton, look.pixel_mm
+    line, px = look.view.skeleton, look.target.pixel_mm
     hole, least = max(round(HOLE_MM / px), 1), MIN_LENGTH_MM / px
-    missed = _missed(look)
+    missed = look.missed > MISSED_SHARE
     # Tracing lines takes far longer than to see that there are none.
     around = np.ones((2 * hole + 1, 2 * hole + 1), np.uint8)
     near = (cv2.dilate((line & missed).astype(np.uint8), around) > 0) & line
@@ -185,9 +201,7 @@ def _lines(number: int, look: Look) -> list[MissedLine]:
     return out
 
 
-def proposal(
-    line: MissedLine, looks: Sequence[Look], tree: Tree, evidence: CenterPoints
-) -> Proposal | None:
+def proposal(line: MissedLine, looks: Sequence[Look], tree: Tree, told: Told) -> Proposal | None:
     """Find the vessel that a line could be; None where no course is likely or it is explained now.
 
     Parameters
@@ -195,21 +209,20 @@ def proposal(
     line : MissedLine of ``looks``, maybe of earlier ones
     looks : of ``tree``
     tree : Tree, at least one branch
-    evidence : what the predictor said of each candidate before any was chosen
+    told : Told
     """
     look = looks[line.view]
-    col, row = np.rint(line.pixels[line.core]).astype(np.int64).T
-    left = look.left_mm[row, col]
-    if np.mean(left / np.maximum(look.seen_mm[row, col], LEAST_PATH_MM)) < MISSED_SHARE:
+    col, row = line.pixels[line.core].astype(np.int64).T
+    if np.mean(look.missed[row, col]) < MISSED_SHARE:
         return None
-    path = float(np.median(left))
-    arc = polyline_arc(line.pixels) * look.pixel_mm
+    path = float(np.median(look.left_mm[row, col]))
+    arc = polyline_arc(line.pixels) * look.target.pixel_mm
     count = max(round(arc[-1] / PLACE_MM), 2) + 1
     places = along(line.pixels, arc, np.linspace(0.0, arc[-1], count))
     step = arc[-1] / (count - 1)
     points = _depths(look, places, tree)
     others = [other for number, other in enumerate(looks) if number != line.view]
-    cost, new = _costs(points, others, path, evidence)
+    cost, new = _costs(points, others, path, told)
     lookup = cKDTree(tree.points())
     courses = []
     for way in (slice(None), slice(None, None, -1)):
@@ -234,21 +247,18 @@ def _depths(look: Look, places: Pixels, tree: Tree) -> Points:
     return points
 
 
-def _costs(
-    points: Points, others: Sequence[Look], path: float, evidence: CenterPoints
-) -> tuple[Array, Array]:
+def _costs(points: Points, others: Sequence[Look], path: float, told: Told) -> tuple[Array, Array]:
     """(n, d) cost per mm of a vessel of that path at (n, d, 3) points, and how much of it is new.
 
     New is the share of its path that the other views show and no tube explains, their mean.
     """
     wanted = max(path, 0.5)
-    total, new = np.zeros((2, *points.shape[:-1]))
+    places = points.reshape(-1, 3)
+    total, new = np.zeros((2, len(places)))
     for look in others:
-        seen, left = (np.minimum(value / wanted, 1.0) for value in look.at(points))
+        pictures = look.seen_mm, look.left_mm
+        seen, left = np.minimum(sampled(look.target.carm, pictures, places) / wanted, 1.0)
         total += NO_VESSEL * (1.0 - seen) + EXPLAINED * np.maximum(seen - left, 0.0)
         new += left / len(others)
-    gap, near = cKDTree(evidence.points_mm).query(
-        points.reshape(-1, 3), distance_upper_bound=evidence.spacing_mm
-    )
-    told = np.append(np.sqrt(evidence.confidence), 0.0)[np.where(np.isfinite(gap), near, -1)]
-    return total / len(others) + NO_EVIDENCE * (1.0 - told.reshape(total.shape)), new
+    cost = total / len(others) + NO_EVIDENCE * (1.0 - told.at(places))
+    return cost.reshape(points.shape[:-1]), new.reshape(points.shape[:-1])

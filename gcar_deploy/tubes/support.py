@@ -8,11 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tree.edit import kept_branches, part_of, with_ends_moved
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Footprint, Tubes
 from gcar_deploy.tubes.targets import Target
-from gcar_deploy.types import Array, Points, Scalars
+from gcar_deploy.types import Array, Points
 
 #: a branch or a free end is dropped where less than this share of it is seen in some view
 MIN_SEEN = 0.4
@@ -150,8 +151,8 @@ def _grow(
         score = np.full(len(ways), np.inf)
         for reach in (radius + GROWTH_STEP_MM, radius + 2 * GROWTH_STEP_MM):
             probe = tip + reach * ways
-            seen = [_sample(t, rest, probe) for t, rest in zip(targets, left, strict=True)]
-            score = np.minimum(score, least_seen(np.stack(seen)))
+            seen = [sampled(t.carm, [rest], probe) for t, rest in zip(targets, left, strict=True)]
+            score = np.minimum(score, least_seen(np.concatenate(seen)))
         score = score - 0.02 * radius * np.arange(len(ways))
         best = int(np.argmax(score))
         if score[best] < GROWTH_SHARE * 2 * radius:
@@ -178,11 +179,8 @@ def _cone(direction: Points) -> Points:
     return np.array(out)
 
 
-def _sample(target: Target, picture: Array, points: Points) -> Scalars:
-    """Bilinear values at projected points; 0 outside the picture."""
-    pixels, depth = target.carm.project(points)
-    at = np.where(depth[:, None] > 1.0, pixels, -10.0)
-    out: Scalars = ndimage.map_coordinates(
-        picture, [at[:, 1], at[:, 0]], order=1, mode="constant", cval=0.0
-    )
-    return out
+def sampled(carm: CArm, pictures: Sequence[Array], points_mm: Points) -> Array:
+    """(k, n) bilinear values of k pictures of one view at (n, 3) projected points; 0 outside."""
+    pixels, depth = carm.project(points_mm)
+    at = np.where(depth[:, None] > 1.0, pixels, -10.0).T[::-1]
+    return np.stack([ndimage.map_coordinates(picture, at, order=1) for picture in pictures])
