@@ -11,6 +11,10 @@ from gcar_deploy.config import TubeOptions
 from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
+from gcar_deploy.tubes.gauss_newton import footprints
+from gcar_deploy.tubes.missed import Told, looked_at, missed_lines, proposal
+from gcar_deploy.tubes.model import tubes_of
+from gcar_deploy.tubes.targets import make_targets
 from tests.tree.shapes import branch, fork, grid, points_of
 from tests.tubes.scenes import carm, seen, two_views
 
@@ -149,6 +153,55 @@ def test_an_end_without_time_keeps_what_there_is():
     assert fit.progress.stopped
     assert cKDTree(fit.tree.points()).query(line[-1])[0] > 5.0
     assert np.isfinite(np.concatenate([b.sigma_mm for b in fit.tree.branches])).all()
+
+
+def _looks(views, *trees):
+    """What the pictures show beside tubes that are where the vessels of a tree are, one a view."""
+    targets = make_targets(views, 0.0, OPTIONS)
+    prints = [
+        footprints(tubes_of(tree), [target])[0] for tree, target in zip(trees, targets, strict=True)
+    ]
+    return looked_at(views, targets, prints)
+
+
+def test_a_line_is_followed_beyond_what_is_missed():
+    truth, known, line = _with_twig()
+    views = _pictures(truth, two_views())
+    found = missed_lines(_looks(views, known, known))
+    assert [one.view for one in found] == [0, 1]
+    for one, view in zip(found, views, strict=True):
+        length = np.linalg.norm(np.diff(view.carm.project(line[[0, -1]])[0], axis=0))
+        core = one.pixels[one.core]
+        assert 0.5 * length < len(core) < len(one.pixels)
+        trunk = view.carm.project(known.branches[0].points_mm)[0]
+        gap, beyond = (cKDTree(trunk).query(part)[0].min() for part in (core, one.pixels))
+        assert beyond < 2.0 < gap
+
+
+def test_where_there_is_no_picture_nothing_is_missed():
+    truth, known, _ = _with_twig()
+    views = [
+        dataclasses.replace(view, valid=np.zeros(view.mask.shape, bool))
+        for view in _pictures(truth, two_views())
+    ]
+    assert missed_lines(_looks(views, known, known)) == []
+
+
+def test_what_tubes_explain_now_is_no_proposal_and_in_other_views_costs_more(monkeypatch):
+    truth, known, _ = _with_twig()
+    views = _pictures(truth, two_views())
+    missed = _looks(views, known, known)
+    line = missed_lines(missed)[0]
+    told = Told.by(_believed(truth, grid(64), 1.0))
+    free = proposal(line, missed, known, told)
+    assert free is not None
+    assert proposal(line, _looks(views, truth, known), known, told) is None
+    # The vessel that would be there is explained by something else: nothing of it is new.
+    taken = _looks(views, known, truth)
+    assert proposal(line, taken, known, told) is None
+    monkeypatch.setattr("gcar_deploy.tubes.missed.LEAST_NEW", 0.0)
+    monkeypatch.setattr("gcar_deploy.tubes.missed.MOST_COST", 9.0)
+    assert proposal(line, taken, known, told).cost > free.cost + 0.5
 
 
 def test_a_new_branch_cuts_the_one_it_leaves():
