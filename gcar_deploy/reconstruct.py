@@ -15,6 +15,7 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import with_polarity
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.vessels import find_vessels
@@ -110,6 +111,7 @@ def _reconstructed(
 
     findings = check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
+        angiograms = [with_polarity(a) for a in angiograms]
         vessels = find_vessels(angiograms, options.imaging, segmenter, watch, report)
         keep(vessels)
     with watch.stage("pose"):

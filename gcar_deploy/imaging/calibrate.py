@@ -10,7 +10,7 @@ import numpy as np
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.segment import Segmentation
-from gcar_deploy.types import Image, Mask
+from gcar_deploy.types import Array, Image, Mask
 
 #: wider vessels than this many pixels (radius) have a width worth believing
 _MIN_RADIUS_PX = 1.5
@@ -55,12 +55,12 @@ def estimate_path(
     found : Segmentation
     pixel_mm : float, pixel size at the isocentre
     """
-    chosen = _simple_stretches(found)
+    chosen, sections = _simple_stretches(found), _Sections.of(found, pixel_mm)
     best: PathEstimate | None = None
     for domain, picture in candidates.items():
         ground = enhance.background(enhance.fill_holes(picture, ~found.valid), found.mask, pixel_mm)
         contrast = np.where(found.valid, picture - ground, np.float32(0))
-        scale, spread = _agreement(contrast, found, chosen, pixel_mm)
+        scale, spread = sections.agreement(contrast, chosen, pixel_mm)
         if best is None or spread < best.spread:
             path = np.where(found.mask, np.clip(contrast, 0, None), np.float32(0)) * scale
             best = PathEstimate(
@@ -89,36 +89,65 @@ def _simple_stretches(found: Segmentation) -> Mask:
     return simple if simple.sum() >= _ENOUGH else found.skeleton
 
 
-def _agreement(
-    contrast: Image, found: Segmentation, chosen: Mask, pixel_mm: float
-) -> tuple[float, float]:
-    """Return (mm per unit of contrast, relative spread).
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Sections:
+    """Sections across the lines of a picture, whatever its grey values.
 
-    The width comes from the profile itself, not from where the mask was cut: a chord profile
-    of peak p has the area A = (pi/2) R p, hence 2 R = 4 A / (pi p).
+    Attributes
+    ----------
+    skeleton, shadow : (rows, cols) bool, the lines, and how far their sections reach
+    label : (rows, cols) number of the nearest pixel of a line
+    smooth_px : averages along a line are Gaussian
+    length, weight : (rows, cols) float32, averages of arc length and of pixels of line
     """
-    margin_px = enhance.MARGIN_MM / pixel_mm
-    reach = 2 * max(1, round(margin_px)) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    shadow = cv2.dilate(found.mask.astype(np.uint8), disc) > 0
-    _, label = cv2.distanceTransformWithLabels(
-        (~found.skeleton).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    total = np.bincount(label[shadow], weights=contrast[shadow], minlength=int(label.max()) + 1)
-    per_pixel = np.where(found.skeleton, total[label], 0).astype(np.float32)
-    smooth = 2.0 * max(1.0, margin_px)
-    length = cv2.GaussianBlur(_arc_length(found.skeleton), (0, 0), smooth)
-    area = cv2.GaussianBlur(per_pixel, (0, 0), smooth) / np.maximum(length, 1e-9)
-    peak_here = cv2.GaussianBlur(contrast, (0, 0), 1.0)
-    _, (peak,) = skel.spread(found.skeleton, (peak_here,), smooth)
-    a, p = area[chosen].astype(np.float64), peak[chosen].astype(np.float64)
-    usable = (a > 0) & (p > 0)
-    if not usable.any():
-        return 0.0, np.inf
-    width_mm = 4 * a[usable] / (np.pi * p[usable]) * pixel_mm
-    ratio = width_mm / p[usable]
-    low, middle, high = np.percentile(ratio, [25, 50, 75])
-    return float(middle), float((high - low) / middle)
+
+    skeleton: Mask
+    shadow: Mask
+    label: Array
+    smooth_px: float
+    length: Image
+    weight: Image
+
+    @staticmethod
+    def of(found: Segmentation, pixel_mm: float) -> _Sections:
+        margin_px = enhance.MARGIN_MM / pixel_mm
+        reach = 2 * max(1, round(margin_px)) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+        smooth = 2.0 * max(1.0, margin_px)
+        return _Sections(
+            skeleton=found.skeleton,
+            shadow=cv2.dilate(found.mask.astype(np.uint8), disc) > 0,
+            label=skel.to_line(found.skeleton)[1],
+            smooth_px=smooth,
+            length=np.asarray(cv2.GaussianBlur(_arc_length(found.skeleton), (0, 0), smooth)),
+            weight=np.asarray(cv2.GaussianBlur(found.skeleton.astype(np.float32), (0, 0), smooth)),
+        )
+
+    def agreement(self, contrast: Image, chosen: Mask, pixel_mm: float) -> tuple[float, float]:
+        """Return (mm per unit of contrast, relative spread) on ``chosen`` pixels of the lines.
+
+        The width comes from the profile itself, not from where the mask was cut: a chord profile
+        of peak p has the area A = (pi/2) R p, hence 2 R = 4 A / (pi p).
+        """
+        total = np.bincount(
+            self.label[self.shadow], contrast[self.shadow], minlength=int(self.label.max()) + 1
+        )
+        section = np.where(self.skeleton, total[self.label], 0).astype(np.float32)
+        area = self._along(section) / np.maximum(self.length, 1e-9)
+        peak = self._along(cv2.GaussianBlur(contrast, (0, 0), 1.0)) / np.maximum(self.weight, 1e-9)
+        a, p = area[chosen].astype(np.float64), peak[chosen].astype(np.float64)
+        usable = (a > 0) & (p > 0)
+        if not usable.any():
+            return 0.0, np.inf
+        width_mm = 4 * a[usable] / (np.pi * p[usable]) * pixel_mm
+        ratio = width_mm / p[usable]
+        low, middle, high = np.percentile(ratio, [25, 50, 75])
+        return float(middle), float((high - low) / middle)
+
+    def _along(self, values: Array) -> Array:
+        """Sum of values on the lines, each by its distance."""
+        on_line = np.where(self.skeleton, values, np.float32(0))
+        return cv2.GaussianBlur(on_line, (0, 0), self.smooth_px)
 
 
 def _arc_length(skeleton: Mask) -> Image:

@@ -17,6 +17,8 @@ SIDE_GAP_SIGMAS = 2.5
 SCALE_POWER = -0.5
 #: what varies more slowly than this is background to the ridge filter
 FLATTEN_SIGMA_MM = 10.0
+#: of pixels up to this size at the isocentre polarity is told as well as of smaller ones, mm
+POLARITY_PIXEL_MM = 0.5
 #: grey level, as a share of the white level, added before the logarithm
 LOG_OFFSET = 0.08
 #: ... and where paths are read from contrast: the window of a display takes the darkest grey value
@@ -212,6 +214,16 @@ def ridges(picture: Image, pixel_mm: float) -> Ridges:
     return Ridges(response=response, sigma_px=best)
 
 
+def _coarser(pixels: Image, pixel_mm: float) -> tuple[Image, float]:
+    """Average blocks of pixels, up to ``POLARITY_PIXEL_MM`` wide; return their size, too."""
+    factor = int(POLARITY_PIXEL_MM / pixel_mm)
+    if factor < 2:
+        return pixels, pixel_mm
+    rows, columns = pixels.shape
+    size = (max(1, columns // factor), max(1, rows // factor))
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)), factor * pixel_mm
+
+
 def vessels_are_dark(pixels: Image, pixel_mm: float) -> tuple[bool, float]:
     """Compare the ridges of the picture with those of its negative.
 
@@ -221,6 +233,7 @@ def vessels_are_dark(pixels: Image, pixel_mm: float) -> tuple[bool, float]:
     margin : float
         Ratio of the two strengths (99th percentile), >= 1; near 1 means undecided.
     """
+    pixels, pixel_mm = _coarser(pixels, pixel_mm)
     holes = collimator(pixels)
     flat = flatten(fill_holes(pixels, holes), FLATTEN_SIGMA_MM / pixel_mm)
     strength = []

@@ -145,7 +145,7 @@ def spread(
     carried : tuple of (rows, cols) float32
         Each value at that skeleton pixel, after a Gaussian average along the line.
     """
-    distance, label = _to_line(skeleton)
+    distance, label = to_line(skeleton)
     weight = cv2.GaussianBlur(skeleton.astype(np.float32), (0, 0), smooth_px)
     carried = []
     for value in values:
@@ -168,7 +168,7 @@ def averaged(
         Mean of distance and ``off_line`` over the pixels of ``inside`` that are nearest to that
         skeleton pixel or, by a Gaussian weight, to those along the line from it.
     """
-    distance, label = _to_line(skeleton)
+    distance, label = to_line(skeleton)
     which, many = label[inside], int(label.max()) + 1
     total = np.bincount(which, (distance + off_line)[inside], many).astype(np.float32)[label]
     count = np.bincount(which, minlength=many).astype(np.float32)[label]
@@ -185,14 +185,14 @@ def beside(reach: Mask, skeleton: Mask, kept: Mask) -> Mask:
     if not kept.any():
         return np.zeros_like(reach)
     near = cv2.dilate(kept.astype(np.uint8), _BLOCK) > 0
-    return reach & _carried(near, skeleton, _to_line(skeleton)[1])
+    return reach & _carried(near, skeleton, to_line(skeleton)[1])
 
 
 def beside_alone(reach: Mask, skeleton: Mask, part: Mask) -> Mask:
     """Pixels of ``reach`` that are ``beside`` a part of the skeleton and not beside the rest."""
     if not part.any():
         return np.zeros_like(reach)
-    label = _to_line(skeleton)[1]
+    label = to_line(skeleton)[1]
     near, far = (
         _carried(cv2.dilate(own.astype(np.uint8), _BLOCK) > 0, skeleton, label)
         for own in (part, skeleton & ~part)
@@ -210,7 +210,7 @@ def mostly(line: Mask, inside: Mask) -> Mask:
     return line & (share > 0.5 * count)
 
 
-def _to_line(skeleton: Mask) -> tuple[Array, Array]:
+def to_line(skeleton: Mask) -> tuple[Array, Array]:
     """(rows, cols) each: distance to the nearest skeleton pixel, and that pixel's number."""
     return cv2.distanceTransformWithLabels(
         (~skeleton).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL

@@ -62,6 +62,19 @@ def test_polarity_is_seen_and_symmetric():
     assert margin > 3 and other > 3
 
 
+def test_polarity_is_that_of_pixels_three_times_as_large():
+    """Polarity is asked of coarse pixels: fine ones, alike up to their size, say the same."""
+    picture = raw_picture(tube_paths())
+    fine = cv2.resize(picture, None, fx=3, fy=3, interpolation=cv2.INTER_LINEAR)
+    pixel_mm = 0.9 * enhance.POLARITY_PIXEL_MM
+    (dark, margin), (same, other) = (
+        enhance.vessels_are_dark(picture, pixel_mm),
+        enhance.vessels_are_dark(fine, pixel_mm / 3),
+    )
+    assert dark and same
+    assert other == pytest.approx(margin, rel=0.1)
+
+
 def test_collimator_is_found_and_a_dark_picture_is_not_one():
     picture = raw_picture(tube_paths())
     row, column = np.indices(picture.shape)

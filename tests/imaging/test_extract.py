@@ -12,6 +12,7 @@ from gcar_deploy.imaging.extract import (
     MASK_ERROR,
     asks_network,
     extract_vessels,
+    with_polarity,
 )
 from gcar_deploy.imaging.resample import area_average, coarsened, resized
 from tests.conftest import data_dir
@@ -99,6 +100,22 @@ def test_polarity_declared_or_seen_gives_the_same_vessels():
     for polarity in ("bright", "auto"):
         turned = extract_vessels(angiogram(negative, polarity=polarity), _OPTIONS)
         assert _dice(turned.mask, dark.mask) > 0.9
+
+
+def test_a_picture_that_is_hardly_bright_is_what_is_usual_of_its_kind():
+    """Lines of both signs, one a little stronger: no reason to turn a picture round."""
+    row, column = np.indices((256, 256))
+    rng = np.random.default_rng(4)
+    level = 120 + 0.2 * column + rng.normal(0, 4, row.shape)
+    level[60:63, 20:230] += 10  # one bright line
+    level[150:153, 20:230] -= 7  # and a dark one that is a little weaker
+    for kind, usual in (("raw", "dark"), ("attenuation", "bright")):
+        given = angiogram(level.astype(np.float32), kind)
+        assert with_polarity(given).intensity.polarity == usual
+        assert with_polarity(with_polarity(given)).intensity.polarity == usual
+    for kind in ("path_length", "mask"):
+        given = angiogram(level.astype(np.float32), kind, mm_per_count=1.0)
+        assert with_polarity(given) is given
 
 
 def test_sixteen_bit_equals_eight_bit_within_quantisation():
