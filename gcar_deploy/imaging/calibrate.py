@@ -119,8 +119,8 @@ class _Sections:
             shadow=cv2.dilate(found.mask.astype(np.uint8), disc) > 0,
             label=skel.to_line(found.skeleton)[1],
             smooth_px=smooth,
-            length=np.asarray(cv2.GaussianBlur(_arc_length(found.skeleton), (0, 0), smooth)),
-            weight=np.asarray(cv2.GaussianBlur(found.skeleton.astype(np.float32), (0, 0), smooth)),
+            length=enhance.wide_blur(_arc_length(found.skeleton), smooth),
+            weight=enhance.wide_blur(found.skeleton.astype(np.float32), smooth),
         )
 
     def agreement(self, contrast: Image, chosen: Mask, pixel_mm: float) -> tuple[float, float]:
@@ -147,7 +147,7 @@ class _Sections:
     def _along(self, values: Array) -> Array:
         """Sum of values on the lines, each by its distance."""
         on_line = np.where(self.skeleton, values, np.float32(0))
-        return cv2.GaussianBlur(on_line, (0, 0), self.smooth_px)
+        return enhance.wide_blur(on_line.astype(np.float32, copy=False), self.smooth_px)
 
 
 def _arc_length(skeleton: Mask) -> Image:

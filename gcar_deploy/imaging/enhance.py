@@ -106,10 +106,11 @@ def fill_holes(picture: Image, holes: Mask) -> Image:
 
 def flatten(picture: Image, sigma_px: float) -> Image:
     """Take away what varies more slowly than a Gaussian of ``sigma_px``."""
-    return picture - _wide_blur(picture, sigma_px)
+    return picture - wide_blur(picture, sigma_px)
 
 
-def _wide_blur(picture: Image, sigma_px: float) -> Image:
+def wide_blur(picture: Image, sigma_px: float) -> Image:
+    """Blur by a Gaussian that is wide: on a coarser picture, where that does not show."""
     factor = max(1, int(sigma_px // 4))
     if factor == 1:
         near = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
@@ -143,7 +144,7 @@ def background(picture: Image, vessel: Mask, pixel_mm: float) -> Image:
 
 
 def _blurred_pair(picture: Image, weight: Image, sigma_px: float) -> tuple[Image, Image]:
-    return _wide_blur(picture * weight, sigma_px), _wide_blur(weight, sigma_px)
+    return wide_blur(picture * weight, sigma_px), wide_blur(weight, sigma_px)
 
 
 def curvature(picture: Image, sigma_px: float) -> tuple[Image, Image, Image]:

@@ -157,7 +157,7 @@ def footprints(
 def rescaled(targets: list[Target], prints: list[Footprint]) -> list[Target]:
     """Refit the contrast of pictures that are not calibrated."""
     return [
-        target if target.calibrated else target.with_contrast(seen.image(target.path_mm.shape))
+        target if target.calibrated else target.with_contrast(seen.covered, seen.totals())
         for target, seen in zip(targets, prints, strict=True)
     ]
 

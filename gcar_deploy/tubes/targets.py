@@ -12,7 +12,7 @@ from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import coarsened
-from gcar_deploy.types import Array
+from gcar_deploy.types import Array, Scalars
 
 #: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
 COARSE_BLUR_PX = 0.6
@@ -53,15 +53,24 @@ class Target:
         """Whether paths are true millimetres."""
         return self.path_error == 0
 
-    def with_contrast(self, model: Array) -> Target:
-        """Fit the contrast factor to a model picture by least squares (variable projection)."""
+    def with_contrast(self, covered: Array, model: Scalars) -> Target:
+        """Fit the contrast factor to a model by least squares (variable projection).
+
+        Parameters
+        ----------
+        covered : (g,) flat index of the pixels that the model covers
+        model : (g,) its path there, mm
+        """
         if self.calibrated:
             return self
-        w = self.weight / self.sigma_mm**2
+        path, weight, sigma = (
+            picture.reshape(-1)[covered] for picture in (self.path_mm, self.weight, self.sigma_mm)
+        )
+        w = weight / sigma**2
         power = float((w * model * model).sum())
         if power <= 0:
             return self
-        factor = float((w * model * self.path_mm).sum()) / power
+        factor = float((w * model * path).sum()) / power
         most = 1 + CONTRAST_SIGMAS * self.path_error
         return dataclasses.replace(self, contrast=float(np.clip(factor, 1 / most, most)))
 
