@@ -7,9 +7,10 @@ the pictures -> tree, volume -> quality
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
-from gcar_deploy.beside import started
+from gcar_deploy.beside import side_by_side, started
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.frame import own_frame
@@ -111,7 +112,7 @@ def _reconstructed(
 
     findings = check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        angiograms = [with_polarity(a) for a in angiograms]
+        angiograms = side_by_side([functools.partial(with_polarity, a) for a in angiograms])
         vessels = find_vessels(angiograms, options.imaging, segmenter, watch, report)
         keep(vessels)
     with watch.stage("pose"):

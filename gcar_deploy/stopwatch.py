@@ -7,13 +7,11 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeVar
 
 from gcar_deploy.errors import CancelledError
 
 _log = logging.getLogger(__name__)
 
-T = TypeVar("T")
 #: called with (stage, share of the whole work done, 0 .. 1)
 OnProgress = Callable[[str, float], None]
 #: what is kept of a deadline, as shares of the time that all before the refinement took: for what
@@ -134,13 +132,6 @@ class Stopwatch:
         self.require(UNREFINED_SHARE * before_s)
         enough = self.left_s >= (BEGIN_SHARE + FINISH_SHARE) * before_s
         return Budget(enough, self.leaving(FINISH_SHARE * before_s))
-
-    def each(self, items: Sequence[T], report: Callable[[float], None]) -> Iterator[T]:
-        """Yield items of equal work: each unless ``check`` raises, with the share done reported."""
-        for done, item in enumerate(items, start=1):
-            self.check()
-            yield item
-            report(done / len(items))
 
     def check(self) -> None:
         """Raise CancelledError if cancelled, or late; for stages without a usable half-result."""

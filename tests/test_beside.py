@@ -8,6 +8,7 @@ import pytest
 from gcar_deploy.beside import allowed_threads, side_by_side, started
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
+from gcar_export.studies.hard_raw import raw_pair
 
 
 def met():
@@ -61,3 +62,14 @@ def test_a_reconstruction_is_the_same_on_one_thread_and_on_three():
         assert np.array_equal(a.points_mm, b.points_mm)
         assert np.array_equal(a.sigma_mm, b.sigma_mm)
         assert np.array_equal(a.radius_mm, b.radius_mm)
+
+
+@pytest.mark.slow
+def test_raw_pictures_are_read_the_same_one_after_the_other_and_at_once():
+    pair = raw_pair(81_030, 1)
+    one, two = (Engine(threads=n).reconstruct(pair.angiograms, pair.grid) for n in (1, 2))
+    for a, b in zip(one.views, two.views, strict=True):
+        assert a.view_id == b.view_id and a.by_network and b.by_network
+        np.testing.assert_array_equal(a.mask, b.mask)
+        np.testing.assert_array_equal(a.path_mm, b.path_mm)
+    np.testing.assert_array_equal(one.tree.points(), two.tree.points())

@@ -12,6 +12,7 @@ wires a second network within the same file says (``line_strips``).
 from __future__ import annotations
 
 import dataclasses
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -129,10 +130,12 @@ class Segmenter:
     ----------
     session : models.Session of it
     should_stop : ends a running inference, see ``models.Session.run``; None lets it run
+    turn : held while the network runs: it uses all cores, and its memory is that of one picture
     """
 
     session: Session
     should_stop: Callable[[], bool] | None = None
+    turn: threading.Lock = dataclasses.field(default_factory=threading.Lock, repr=False)
 
     def watched(self, should_stop: Callable[[], bool] | None) -> Segmenter:
         """Return the same network, whose inference ends soon after ``should_stop`` says so."""
@@ -174,7 +177,8 @@ class Segmenter:
     def _run(
         self, wanted: Sequence[str], shapes: list[tuple[int, ...]], feed: dict[str, Array]
     ) -> list[Array]:
-        return self.session.run(feed, shapes, outputs=wanted, should_stop=self.should_stop)
+        with self.turn:
+            return self.session.run(feed, shapes, outputs=wanted, should_stop=self.should_stop)
 
 
 def open_segmenter(path: Path, *, threads: int = 2) -> Segmenter:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
+from gcar_deploy.beside import side_by_side
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, extract_vessels
@@ -53,6 +55,14 @@ def find_vessels(
     """
     used, missing = asked_network(angiograms, options, segmenter)
     watched = used and used.watched(watch.question)
-    views = [extract_vessels(a, options, watched) for a in watch.each(angiograms, report)]
+
+    def found(angiogram: Angiogram) -> VesselImage:
+        watch.check()
+        return extract_vessels(angiogram, options, watched)
+
+    watch.check()
+    # Filters use one core each, and wait for each other where both ask the network.
+    views = side_by_side([functools.partial(found, one) for one in angiograms])
+    report(1.0)
     said = used if any(view.by_network for view in views) else None
     return Vessels(views=tuple(views), segmenter=said, findings=tuple(missing))
