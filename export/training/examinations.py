@@ -13,6 +13,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.predict.hull import visual_hull
 from gcar_export.scenes.capsules import Capsules, LabelTree
+from gcar_export.scenes.free_tubes import free_tubes
 from gcar_export.scenes.gantry import (
     PAPER_VIEWS,
     USUAL_SPREAD_DEG,
@@ -64,6 +65,8 @@ class SceneOptions:
     more_views_share: float = 0.12
     #: scenes drawn from users' label volumes where some are given
     label_share: float = 0.5
+    #: of the others, tubes that are no coronary tree; none among the usual views
+    free_share: float = 0.25
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -106,6 +109,8 @@ def examination(
     thin = regime == "fine" or (not paper and rng.random() < options.thin_share)
     if labels and rng.random() < options.label_share:
         tree = _label_tree(rng, labels, paper)
+    elif not usual and rng.random() < options.free_share:
+        tree = free_tubes(rng, rng.uniform(0.22, 0.5) if thin else 0.5)
     else:
         tree = _generated(rng, _style(rng, options, thin), paper)
     if not usual:
