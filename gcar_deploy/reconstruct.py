@@ -16,9 +16,9 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import with_polarity
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
+from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.vessels import find_vessels
 from gcar_deploy.measure import (
     from_inlets,

@@ -21,7 +21,8 @@ from gcar_deploy.geometry.epipolar import plane_axes, slices_along
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.imaging.extract import above_half, is_dark
+from gcar_deploy.imaging.extract import above_half
+from gcar_deploy.imaging.polarity import is_dark
 from gcar_deploy.types import Array, Image, Mask
 
 #: longer side of the pictures that are compared, pixels

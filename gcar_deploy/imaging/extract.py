@@ -21,15 +21,13 @@ from gcar_deploy.imaging.learned import Found, learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.imaging.path_noise import vessels_in_noise
+from gcar_deploy.imaging.polarity import is_dark, with_polarity
 from gcar_deploy.imaging.standing import what_came, without_standing
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
 #: what ``bright_vessels`` gives
 _Grey: TypeAlias = tuple[dict[str, Image], Mask]
-#: polarity is taken from the picture only when one sign answers this much more strongly. Forty real
-#: pictures: dark by 1.5 and more; generated ones of noise and thick bone: bright by up to 1.2
-_POLARITY_MARGIN = 1.4
 #: relative error of a path that was judged from contrast, and by the network
 CONTRAST_ERROR, CHORD_ERROR = 0.25, 0.15
 #: ... and from the width of a mask: its edges are off by a part of a pixel, a vessel seen at a
@@ -387,31 +385,6 @@ def _contrast_path(
     if estimate.mm_per_unit <= 0:
         raise _nothing(angiogram, "the lines found have no contrast")
     return estimate.path_mm
-
-
-def with_polarity(angiogram: Angiogram) -> Angiogram:
-    """Return the picture with its polarity declared: it is looked for once."""
-    told = angiogram.intensity
-    if told.kind in ("path_length", "mask") or told.polarity != "auto":
-        return angiogram
-    polarity = "dark" if is_dark(angiogram) else "bright"
-    return dataclasses.replace(angiogram, intensity=dataclasses.replace(told, polarity=polarity))
-
-
-def is_dark(angiogram: Angiogram) -> bool:
-    """Whether vessels are darker than their surroundings: declared, else seen, else usual."""
-    declared = angiogram.intensity.polarity
-    if declared != "auto":
-        return declared == "dark"
-    usual = angiogram.intensity.kind == "raw"
-    seen, margin = enhance.vessels_are_dark(angiogram.pixels, angiogram.carm.pixel_at_isocenter_mm)
-    decided = margin >= _POLARITY_MARGIN
-    _log.info(
-        "view %s: vessels taken as %s (%s, strengths differ by a factor %.2f)",
-        angiogram.view_id, "dark" if (seen if decided else usual) else "bright",
-        "seen in the picture" if decided else f"usual for {angiogram.intensity.kind}", margin,
-    )  # fmt: skip
-    return seen if decided else usual
 
 
 def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Image], Mask]:

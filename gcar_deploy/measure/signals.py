@@ -11,7 +11,8 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import above_half, is_dark
+from gcar_deploy.imaging.extract import above_half
+from gcar_deploy.imaging.polarity import is_dark
 from gcar_deploy.types import Array, Image, Mask
 
 #: display curves that are tried: path as -log(level + offset); a large offset is a linear one

@@ -11,7 +11,7 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import epipolar_lines
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import is_dark
+from gcar_deploy.imaging.polarity import is_dark
 from gcar_deploy.output.overlay import grey8, png_bytes
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.result import Result

@@ -10,7 +10,8 @@ from skimage.graph import route_through_array
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import bright_vessels, is_dark
+from gcar_deploy.imaging.extract import bright_vessels
+from gcar_deploy.imaging.polarity import is_dark
 from gcar_deploy.types import Array, Image
 
 #: the way may leave the straight line by this share of its length, and so many pixels

@@ -12,8 +12,8 @@ from gcar_deploy.imaging.extract import (
     MASK_ERROR,
     asks_network,
     extract_vessels,
-    with_polarity,
 )
+from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.resample import area_average, coarsened, resized
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
