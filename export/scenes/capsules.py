@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
+
+#: (m, 3) points along a line and (m,) radii, mm
+Tube = tuple[np.ndarray, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -14,6 +18,15 @@ class Capsules:
     starts: np.ndarray
     ends: np.ndarray
     radii: np.ndarray
+
+    @staticmethod
+    def of(tubes: Sequence[Tube]) -> Capsules:
+        """Cover tubes; a capsule's radius is the mean of those at its ends."""
+        return Capsules(
+            np.concatenate([points[:-1] for points, _ in tubes]),
+            np.concatenate([points[1:] for points, _ in tubes]),
+            np.concatenate([0.5 * (radius[1:] + radius[:-1]) for _, radius in tubes]),
+        )
 
     def moved(self, shift_mm: np.ndarray) -> Capsules:
         """Return the tree moved by (3,) mm."""

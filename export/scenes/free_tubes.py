@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcar_export.scenes.capsules import Capsules
+from gcar_export.scenes.capsules import Capsules, Tube
 from gcar_export.scenes.tree_curves import STEP_MM, texture_radius, unit
 
-#: (m, 3) points and (m,) radii in mm
-Tube = tuple[np.ndarray, np.ndarray]
 #: how often there are one, two, three trees that do not touch
 TREES = (0.75, 0.2, 0.05)
 RING_SHARE = TWIN_SHARE = 0.12
@@ -37,16 +35,14 @@ def free_tubes(rng: np.random.Generator, thinnest_mm: float = 0.5) -> Capsules:
     if rng.random() < TWIN_SHARE:
         tubes.append(_twin(rng, tubes[int(rng.integers(len(tubes)))]))
     wall = float(rng.choice([0.0, 0.03, 0.1]))
-    points = [p for p, _ in tubes]
-    every = np.concatenate(points)
+    every = np.concatenate([points for points, _ in tubes])
     middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
     smaller = min(1.0, REACH_MM / float(np.linalg.norm(every - middle, axis=1).max()))
-    radii = [texture_radius(rng, r, thinnest_mm, wall, thinnest_mm) for _, r in tubes]
-    points = [(p - middle) * smaller for p in points]
-    return Capsules(
-        np.concatenate([p[:-1] for p in points]),
-        np.concatenate([p[1:] for p in points]),
-        np.concatenate([0.5 * (r[1:] + r[:-1]) for r in radii]),
+    return Capsules.of(
+        [
+            (smaller * (points - middle), texture_radius(rng, r, thinnest_mm, wall, thinnest_mm))
+            for points, r in tubes
+        ]
     )
 
 

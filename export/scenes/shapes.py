@@ -6,11 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gcar_export.scenes.capsules import Capsules
+from gcar_export.scenes.capsules import Capsules, Tube
 from gcar_export.scenes.tree_curves import unit
 
-#: (m, 3) points and (m,) radii in mm
-Tube = tuple[np.ndarray, np.ndarray]
 Shape = Callable[[np.random.Generator], list[Tube]]
 _POINTS = 100
 
@@ -129,10 +127,5 @@ def shape(name: str, rng: np.random.Generator) -> tuple[Capsules, list[np.ndarra
     tubes = SHAPES[name](rng)
     every = np.concatenate([points for points, _ in tubes])
     middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
-    lines = [points - middle for points, _ in tubes]
-    lumen = Capsules(
-        np.concatenate([line[:-1] for line in lines]),
-        np.concatenate([line[1:] for line in lines]),
-        np.concatenate([0.5 * (radius[1:] + radius[:-1]) for _, radius in tubes]),
-    )
-    return lumen, lines
+    tubes = [(points - middle, radius) for points, radius in tubes]
+    return Capsules.of(tubes), [points for points, _ in tubes]

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 
 import click
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
@@ -30,7 +29,7 @@ from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import any_style, random_tree
-from gcar_export.studies.pair_rows import Judged, head, row
+from gcar_export.studies.pair_rows import Judged, head, row, shares
 from gcar_export.studies.wrong_scenes import SIDES
 
 SEED = 81_030
@@ -83,10 +82,7 @@ def judged(seed: int, pairs: int) -> Iterator[tuple[str, *Judged]]:
             except GcarError:
                 yield name, 0.0, 0.0, "refused"
                 continue
-            points = result.tree.points()
-            found = cKDTree(points).query(pair.line_mm)[0] <= NEAR_MM
-            ours = cKDTree(pair.line_mm).query(points)[0] <= NEAR_MM
-            yield name, float(found.mean()), float(ours.mean()), result.status
+            yield name, *shares(result.tree.points(), pair.line_mm, NEAR_MM), result.status
 
 
 def table(rows: Sequence[tuple[str, *Judged]]) -> str:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 
 import click
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
@@ -23,6 +22,7 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Array
 from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
+from gcar_export.studies.pair_rows import shares
 from gcar_export.studies.wrong_scenes import Exam, exam
 
 SEED = 31_007
@@ -72,17 +72,13 @@ def judged(pairs: int) -> Iterator[tuple[str, float, float, str]]:
     engine, grid = Engine(), clinical_geometry(2)[2]
     for number in range(pairs):
         case = exam(SEED, number, "path_length", 2)
-        true = cKDTree(case.line_mm)
         for name, look in LOOKS.items():
             try:
                 result = engine.reconstruct(pictures(case, look, number), grid)
             except GcarError:
                 yield name, 0.0, 0.0, "refused"
                 continue
-            points = result.tree.points()
-            found = cKDTree(points).query(case.line_mm)[0] <= NEAR_MM
-            ours = true.query(points)[0] <= NEAR_MM
-            yield name, float(found.mean()), float(ours.mean()), result.status
+            yield name, *shares(result.tree.points(), case.line_mm, NEAR_MM), result.status
 
 
 def table(rows: list[tuple[str, float, float, str]]) -> str:

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 
 import click
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
@@ -31,7 +30,7 @@ from gcar_export.scenes.protocols import MASK_PATH_MM
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.shapes import SHAPES, shape
-from gcar_export.studies.pair_rows import Judged, head, row
+from gcar_export.studies.pair_rows import Judged, head, row, shares
 
 SEED = 5
 NEAR_MM = 1.5
@@ -104,17 +103,14 @@ def judged(
     """Yield kind, shape, share of the true line found, of ours that is true, and status."""
     for number in numbers:
         of = scene(seed, number)
-        true = cKDTree(of.line_mm)
         for kind in kinds:
             try:
                 result = engine.reconstruct(pictures(of, kind, seed, number), GRID)
             except GcarError:
                 yield kind, of.name, 0.0, 0.0, "refused"
                 continue
-            points = result.tree.points()
-            found = cKDTree(points).query(of.line_mm)[0] <= NEAR_MM if len(points) else np.zeros(1)
-            ours = true.query(points)[0] <= NEAR_MM if len(points) else np.zeros(1)
-            yield kind, of.name, float(found.mean()), float(ours.mean()), result.status
+            near = shares(result.tree.points(), of.line_mm, NEAR_MM)
+            yield kind, of.name, *near, result.status
 
 
 def table(rows: Sequence[tuple[str, str, *Judged]]) -> str:

@@ -5,9 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
+
+from gcar_deploy.types import Points
 
 #: share of the true line found, share of ours that is true, status (``refused``: both 0)
 Judged = tuple[float, float, str]
+
+
+def shares(points_mm: Points, line_mm: Points, near_mm: float) -> tuple[float, float]:
+    """Share of (m, 3) true points with one of (n, 3) ours near by, and of ours with a true one."""
+    found = cKDTree(points_mm).query(line_mm)[0] <= near_mm
+    ours = cKDTree(line_mm).query(points_mm)[0] <= near_mm
+    return float(found.mean()), float(ours.mean())
 
 
 def head(first: str, near_mm: float) -> str:

@@ -116,11 +116,17 @@ def wide_blur(picture: Image, sigma_px: float) -> Image:
         near = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
         return np.asarray(near, dtype=np.float32)
     rows, columns = picture.shape
-    size = (max(1, columns // factor), max(1, rows // factor))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (0, 0), sigma_px / factor, borderType=cv2.BORDER_REPLICATE)
+    small = cv2.GaussianBlur(
+        _smaller(picture, factor), (0, 0), sigma_px / factor, borderType=cv2.BORDER_REPLICATE
+    )
     small = cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return np.asarray(small, dtype=np.float32)
+
+
+def _smaller(picture: Image, factor: int) -> Image:
+    rows, columns = picture.shape
+    size = (max(1, columns // factor), max(1, rows // factor))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def background(picture: Image, vessel: Mask, pixel_mm: float) -> Image:
@@ -220,9 +226,7 @@ def _coarser(pixels: Image, pixel_mm: float) -> tuple[Image, float]:
     factor = int(POLARITY_PIXEL_MM / pixel_mm)
     if factor < 2:
         return pixels, pixel_mm
-    rows, columns = pixels.shape
-    size = (max(1, columns // factor), max(1, rows // factor))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)), factor * pixel_mm
+    return _smaller(pixels, factor), factor * pixel_mm
 
 
 def vessels_are_dark(pixels: Image, pixel_mm: float) -> tuple[bool, float]:

@@ -60,7 +60,6 @@ def find_vessels(
         watch.check()
         return extract_vessels(angiogram, options, watched)
 
-    watch.check()
     # Filters use one core each, and wait for each other where both ask the network.
     views = side_by_side([functools.partial(found, one) for one in angiograms])
     report(1.0)
