@@ -53,7 +53,7 @@ def refine_table(data: Path, cases: str, protocols: str, noises: str, out: Path 
 
 @click.command("cost-curves")
 def cost_curves() -> None:
-    """Time refinement against Gaussians, vessel, views, pixels, voxels; print the exponents.
+    """Time the stages against Gaussians, vessel, views, pixels, voxels; print the exponents.
 
     Example: gcar-export cost-curves
     """

@@ -15,24 +15,29 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.stats import t as student
 
-from gcar_deploy.config import RefineOptions
+from gcar_deploy.config import ImagingOptions, RefineOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.gaussians.project import project, project_vjp
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.imaging.net import load_segmenter
 from gcar_deploy.selftest import EDGE_MM, tiny_tree
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
 from gcar_deploy.tubes.refine import Refined, refine, refined_volume
+from gcar_export.scenes.raw_pictures import raw_picture
 
 GAUSSIANS = (100, 300, 1000, 3000, 10_000)
 #: vessels side by side, each of ``VESSEL_MM``
 VESSELS, VESSEL_MM = (1, 2, 4, 8), 40
 VIEWS = (2, 4, 8, 16)
 PIXELS = (128, 256, 512, 1024)
+RAW_PIXELS = (256, 512, 1024, 2048)
 #: voxels along an edge of the volume
 EDGES = (48, 72, 108, 162)
 REPEATS = 3
@@ -79,6 +84,9 @@ def works() -> Works:
         "views (whole tube refinement, 256 px)": {n: _tubes(tree, n, 256) for n in VIEWS},
         "pixels along an edge (whole tube refinement, 2 views)": {
             n: _tubes(tree, 2, n) for n in PIXELS
+        },
+        "pixels along an edge (finding the vessels of one raw picture)": {
+            n: _search(tree, n) for n in RAW_PIXELS
         },
         "voxels (volume of a fitted tree, 2 views, 256 px)": {n**3: _volume(n) for n in EDGES},
     }
@@ -171,6 +179,18 @@ def _tubes(tree: Tree, views: int, pixels: int) -> Callable[[], Refined]:
     )
     seen = _views(tree, views, pixels)
     return lambda: refine(centers, seen, RefineOptions())
+
+
+def _search(tree: Tree, pixels: int) -> Callable[[], object]:
+    """Return the search for vessels in a raw picture of a tree."""
+    segmenter = load_segmenter("auto")
+    rng = np.random.default_rng(pixels)
+    (seen,) = _views(tree, 1, pixels)
+    picture = Angiogram(
+        view_id="1", carm=seen.carm, pixels=raw_picture(seen.path_mm, rng).astype(np.float32),
+        bit_depth=8, intensity=Intensity(kind="raw", polarity="dark"), sha256=str(pixels),
+    )  # fmt: skip
+    return lambda: extract_vessels(picture, ImagingOptions(), segmenter)
 
 
 def _volume(edge: int) -> Callable[[], object]:

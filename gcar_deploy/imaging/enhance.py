@@ -7,6 +7,7 @@ import dataclasses
 import cv2
 import numpy as np
 
+from gcar_deploy.imaging import coarse
 from gcar_deploy.types import Array, Image, Mask
 
 #: Gaussian widths of the ridge filter: vessel diameters of some 1 to 7 mm
@@ -57,6 +58,13 @@ def absorbance(pixels: Image) -> Image:
 
 def collimator(pixels: Image) -> Mask:
     """(rows, cols) bool: dark, even areas that reach the border, wider than any vessel."""
+    small = coarse.searched_shape(pixels.shape)
+    if small == pixels.shape:
+        return _collimator(pixels)
+    return coarse.inside(_collimator(coarse.averaged(pixels, small)), pixels.shape)
+
+
+def _collimator(pixels: Image) -> Mask:
     rows, columns = pixels.shape
     side = min(rows, columns)
     smooth = cv2.GaussianBlur(pixels, (0, 0), max(1.0, side / 150))

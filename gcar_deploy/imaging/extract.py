@@ -15,6 +15,7 @@ from gcar_deploy.imaging import calibrate, enhance, even_ground, segment
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.border import cut_out, put_back, shown_box
+from gcar_deploy.imaging.coarse import as_fine, coarser
 from gcar_deploy.imaging.edits import edited
 from gcar_deploy.imaging.fusion import fused, without_device
 from gcar_deploy.imaging.learned import Found, learned_vessels
@@ -105,8 +106,11 @@ def _found(
         drawn = even_ground.shadow(grey[0]["linear"], grey[1])
         if drawn is not None:
             return put_back(_from_shadow(part, grey, drawn), angiogram, box)
+    small = coarser(part)
+    grey = grey if small is part else _grey_values(small)
     # Beside anatomy, widths and chords tell the laws apart too badly to choose one.
-    return put_back(_seen(part, _under(grey, "display"), options, segmenter), angiogram, box)
+    seen = _seen(small, _under(grey, "display"), options, segmenter)
+    return put_back(as_fine(seen, part), angiogram, box)
 
 
 def _under(grey: _Grey, *laws: str) -> _Grey:

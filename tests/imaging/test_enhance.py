@@ -75,10 +75,11 @@ def test_polarity_is_that_of_pixels_three_times_as_large():
     assert other == pytest.approx(margin, rel=0.1)
 
 
-def test_collimator_is_found_and_a_dark_picture_is_not_one():
-    picture = raw_picture(tube_paths())
+@pytest.mark.parametrize("size", [256, 1300])
+def test_collimator_is_found_and_a_dark_picture_is_not_one(size):
+    picture = raw_picture(tube_paths(size, oversample=2))
     row, column = np.indices(picture.shape)
-    outside = np.hypot(row - 128, column - 128) > 140
+    outside = np.hypot(row - size / 2, column - size / 2) > 0.547 * size
     holes = enhance.collimator(np.where(outside, np.float32(6), picture))
     assert holes[outside].mean() > 0.95
     assert holes[~outside].mean() < 0.12

@@ -1,0 +1,85 @@
+"""Large grey pictures are searched with fewer pixels: the lines are the same, the time is not.
+
+Filters cost what a picture has of pixels, and the network sees ``net.SIDE`` of them across anyway.
+What is found is carried back to the pixels that were given, so that nobody else has to know.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.types import Image, Mask
+
+#: a picture is searched with at least so many pixels along its longer side, and fewer than twice
+SEARCHED_SIDE = 512
+
+
+def coarser(angiogram: Angiogram) -> Angiogram:
+    """Return a picture with pixels so many times as large as leave ``SEARCHED_SIDE`` across.
+
+    A picture of less than twice that side is returned as it is. Without what was drawn in it.
+    """
+    small = searched_shape(angiogram.pixels.shape)
+    if small == angiogram.pixels.shape:
+        return angiogram
+    valid = angiogram.valid
+    return dataclasses.replace(
+        angiogram,
+        carm=angiogram.carm.resized(*small),
+        pixels=averaged(angiogram.pixels, small),
+        valid=None if valid is None else averaged(valid.astype(np.float32), small) > 0.5,
+        erased=None,
+        painted=None,
+        bare=tuple(averaged(one, small) for one in angiogram.bare),
+    )
+
+
+def as_fine(found: VesselImage, angiogram: Angiogram) -> VesselImage:
+    """Return what was found in ``coarser(angiogram)`` on the pixels of the picture itself."""
+    shape, kept = angiogram.pixels.shape, found.kept
+    if found.mask.shape == shape:
+        return found
+    mask = inside(found.mask, shape)
+    catheter = None if found.catheter is None else inside(found.catheter, shape) & ~mask
+    return dataclasses.replace(
+        found,
+        carm=angiogram.carm,
+        path_mm=_between(found.path_mm, shape),
+        mask=mask,
+        skeleton=skel.skeletonize(mask),
+        valid=inside(found.valid, shape),
+        vesselness=None if found.vesselness is None else _between(found.vesselness, shape),
+        catheter=catheter,
+        device=None if found.device is None else _between(found.device, shape),
+        others=tuple(as_fine(other, angiogram) for other in found.others),
+        kept=None if kept is None else lambda: as_fine(kept(), angiogram),
+    )
+
+
+def searched_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns that a picture of ``shape`` is searched with."""
+    rows, columns = shape
+    factor = max(max(rows, columns) // SEARCHED_SIDE, 1)
+    return max(rows // factor, 1), max(columns // factor, 1)
+
+
+def averaged(picture: Image, shape: tuple[int, int]) -> Image:
+    """Mean of a picture over the pixels of a smaller ``shape`` (rows, columns)."""
+    small = cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.float32)
+
+
+def _between(picture: Image, shape: tuple[int, ...]) -> Image:
+    large = cv2.resize(picture, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large, dtype=np.float32)
+
+
+def inside(mask: Mask, shape: tuple[int, ...]) -> Mask:
+    """Pixels of a larger ``shape`` (rows, columns) whose centres lie in a coarser mask."""
+    covered: Mask = _between(mask.astype(np.float32), shape) > 0.5
+    return covered
