@@ -25,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 #: readings of two views, of those that agree best as they stand, whose correction is estimated
 READINGS = 4
+#: share of a view's lines below which a reading counts as if it kept so much
+LEAST_KEPT = 0.05
 #: of the further readings of a view the first are what each method sees
 METHODS = 2
 
@@ -109,17 +111,30 @@ def _closest(
     views: Sequence[VesselImage], poses: tuple[Pose, ...],
     readings: Sequence[Sequence[VesselImage]], options: RunOptions,
 ) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:  # fmt: skip
-    """Take the first reading that agrees far better than all before it, if any."""
+    """Take the first reading that agrees far better than all before it, if any.
+
+    Who shows less disagrees about less: the disagreement counts by the share of lines that is left.
+    """
     limits, worst = options.quality, max(p.after for p in poses)
     if worst <= limits.alone_disagreement_raw:
         return views, poses
+    whole = views
     for read in readings:
         closer = poses_between(read, options)
-        after = max(p.after for p in closer)
+        after = max(p.after for p in closer) / max(_kept(read, whole), LEAST_KEPT)
         if limits.alone_ratio * after < worst:
             _log.info("the views agree better by what one method sees of them, or without rims")
             views, poses, worst = read, closer, after
     return views, poses
+
+
+def _kept(read: Sequence[VesselImage], whole: Sequence[VesselImage]) -> float:
+    """Share of their lines that readings of views keep, 0 .. 1, of the view that loses most."""
+    shares = [
+        float(one.skeleton.sum()) / max(float(view.skeleton.sum()), 1.0)
+        for one, view in zip(read, whole, strict=True)
+    ]
+    return min(1.0, *shares)
 
 
 def _by_method(

@@ -230,3 +230,21 @@ def test_each_view_is_read_as_it_agrees_best():
     kept, poses, findings = agreeing(angiograms, views, OPTIONS)
     assert kept[0] is one and kept[1] is views[1] and not findings
     assert poses[1].after < OPTIONS.quality.alone_disagreement_raw
+
+
+def test_a_reading_that_shows_a_part_alone_does_not_stand_for_the_tree():
+    """What holds a third of the lines disagrees about a third; whole trees are worth more."""
+    angiograms, views = by_contrast((1.0, -1.0))
+    starts, ends, radii = random_tree(np.random.default_rng(4)).sides("left").segments()
+    thick = radii > np.quantile(radii, 0.75)
+    parts = []
+    for view, factor in zip(views, (0.6, -0.6), strict=True):
+        path = render.path_lengths(view.carm, starts[thick], ends[thick], radii[thick])
+        path = np.where(path < 0.5, 0, path * np.exp(factor * np.linspace(-1, 1, 192)))
+        parts.append(_view(view.carm, path.astype(np.float32), False))
+    before, after = (poses_between(read, OPTIONS)[1].after for read in (views, parts))
+    assert before > OPTIONS.quality.alone_disagreement_raw
+    assert OPTIONS.quality.alone_ratio * after < before
+    tried = [dataclasses.replace(v, others=(p,)) for v, p in zip(views, parts, strict=True)]
+    for new, old in zip(agreeing(angiograms, tried, OPTIONS)[0], tried, strict=True):
+        assert new is old
