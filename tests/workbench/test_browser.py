@@ -226,12 +226,12 @@ def test_a_stated_alternative_is_shown_and_picked(serve, browse):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("segmenter", "gain", "least"), [("classic", 0.03, 0.76), ("auto", 0, 0.81)]
+    ("segmenter", "gain", "least"), [("classic", 0.01, 0.78), ("auto", -0.005, 0.82)]
 )
 def test_corrections_mend_a_raw_case(serve, engine, segmenter, gain, least):
     """Two ends of vessels that view 1 lacks and a faint one, painted.
 
-    DSC by the ridge filter alone from 0.724 to 0.775; the network finds the ends by itself.
+    DSC by the ridge filter alone from 0.779 to 0.798; the network finds the ends by itself (0.834).
     """
     import nibabel
 
