@@ -24,18 +24,18 @@ def coarser(angiogram: Angiogram) -> Angiogram:
 
     A picture of less than twice that side is returned as it is. Without what was drawn in it.
     """
-    small = searched_shape(angiogram.pixels.shape)
-    if small == angiogram.pixels.shape:
+    factor = searched_factor(angiogram.pixels.shape)
+    if factor == 1:
         return angiogram
-    valid = angiogram.valid
+    pixels, valid = smaller(angiogram.pixels, factor), angiogram.valid
     return dataclasses.replace(
         angiogram,
-        carm=angiogram.carm.resized(*small),
-        pixels=averaged(angiogram.pixels, small),
-        valid=None if valid is None else averaged(valid.astype(np.float32), small) > 0.5,
+        carm=angiogram.carm.resized(*pixels.shape),
+        pixels=pixels,
+        valid=None if valid is None else smaller(valid.astype(np.float32), factor) > 0.5,
         erased=None,
         painted=None,
-        bare=tuple(averaged(one, small) for one in angiogram.bare),
+        bare=tuple(smaller(one, factor) for one in angiogram.bare),
     )
 
 
@@ -61,17 +61,16 @@ def as_fine(found: VesselImage, angiogram: Angiogram) -> VesselImage:
     )
 
 
-def searched_shape(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Rows and columns that a picture of ``shape`` is searched with."""
-    rows, columns = shape
-    factor = max(max(rows, columns) // SEARCHED_SIDE, 1)
-    return max(rows // factor, 1), max(columns // factor, 1)
+def searched_factor(shape: tuple[int, ...]) -> int:
+    """How many times as large the pixels are that a picture of ``shape`` is searched with."""
+    return max(max(shape) // SEARCHED_SIDE, 1)
 
 
-def averaged(picture: Image, shape: tuple[int, int]) -> Image:
-    """Mean of a picture over the pixels of a smaller ``shape`` (rows, columns)."""
-    small = cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.float32)
+def smaller(picture: Image, factor: int) -> Image:
+    """Mean of a picture over pixels about ``factor`` times as large, a whole number of them."""
+    rows, columns = picture.shape
+    size = (max(1, columns // factor), max(1, rows // factor))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _between(picture: Image, shape: tuple[int, ...]) -> Image:

@@ -58,10 +58,10 @@ def absorbance(pixels: Image) -> Image:
 
 def collimator(pixels: Image) -> Mask:
     """(rows, cols) bool: dark, even areas that reach the border, wider than any vessel."""
-    small = coarse.searched_shape(pixels.shape)
-    if small == pixels.shape:
+    factor = coarse.searched_factor(pixels.shape)
+    if factor == 1:
         return _collimator(pixels)
-    return coarse.inside(_collimator(coarse.averaged(pixels, small)), pixels.shape)
+    return coarse.inside(_collimator(coarse.smaller(pixels, factor)), pixels.shape)
 
 
 def _collimator(pixels: Image) -> Mask:
@@ -125,16 +125,10 @@ def wide_blur(picture: Image, sigma_px: float) -> Image:
         return np.asarray(near, dtype=np.float32)
     rows, columns = picture.shape
     small = cv2.GaussianBlur(
-        _smaller(picture, factor), (0, 0), sigma_px / factor, borderType=cv2.BORDER_REPLICATE
+        coarse.smaller(picture, factor), (0, 0), sigma_px / factor, borderType=cv2.BORDER_REPLICATE
     )
     small = cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return np.asarray(small, dtype=np.float32)
-
-
-def _smaller(picture: Image, factor: int) -> Image:
-    rows, columns = picture.shape
-    size = (max(1, columns // factor), max(1, rows // factor))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def background(picture: Image, vessel: Mask, pixel_mm: float) -> Image:
@@ -234,7 +228,7 @@ def _coarser(pixels: Image, pixel_mm: float) -> tuple[Image, float]:
     factor = int(POLARITY_PIXEL_MM / pixel_mm)
     if factor < 2:
         return pixels, pixel_mm
-    return _smaller(pixels, factor), factor * pixel_mm
+    return coarse.smaller(pixels, factor), factor * pixel_mm
 
 
 def vessels_are_dark(pixels: Image, pixel_mm: float) -> tuple[bool, float]:
