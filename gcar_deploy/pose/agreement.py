@@ -25,8 +25,6 @@ _log = logging.getLogger(__name__)
 
 #: readings of two views, of those that agree best as they stand, whose correction is estimated
 READINGS = 4
-#: share of a view's lines below which a reading counts as if it kept so much
-LEAST_KEPT = 0.05
 #: of the further readings of a view the first are what each method sees
 METHODS = 2
 
@@ -121,10 +119,10 @@ def _closest(
     whole = views
     for read in readings:
         closer = poses_between(read, options)
-        after = max(p.after for p in closer) / max(_kept(read, whole), LEAST_KEPT)
-        if limits.alone_ratio * after < worst:
+        after, kept = max(p.after for p in closer), _kept(read, whole)
+        if limits.alone_ratio * after < kept * worst:
             _log.info("the views agree better by what one method sees of them, or without rims")
-            views, poses, worst = read, closer, after
+            views, poses, worst = read, closer, after / kept
     return views, poses
 
 
