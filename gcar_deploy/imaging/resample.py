@@ -37,7 +37,7 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     mask = (area_average(old.mask.astype(np.float32), rows, columns) >= 0.5) | line
     mask &= path > 0
     valid = area_average(old.valid.astype(np.float32), rows, columns) >= 0.5
-    response, catheter = old.vesselness, old.catheter
+    response, catheter, device = old.vesselness, old.catheter, old.device
     if catheter is not None:
         catheter = (area_average(catheter.astype(np.float32), rows, columns) >= 0.5) & ~mask
     return dataclasses.replace(
@@ -51,6 +51,7 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
         valid=valid,
         vesselness=None if response is None else area_average(response, rows, columns),
         catheter=catheter,
+        device=None if device is None else area_average(device, rows, columns),
     )
 
 

@@ -1,0 +1,109 @@
+"""Pixels that are longer one way show the same vessel as square ones of the same field."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gcar_deploy.engine import Engine
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.square import square_point, square_shape, squared
+from tests.hard.phantoms import (
+    GRID,
+    PAIR,
+    angiogram,
+    carm,
+    distances,
+    path_of,
+    paths,
+    seven,
+    straight,
+)
+
+#: rows, columns and spacing of one field of 154 x 154 mm
+TALL = {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.6, 1.2)}
+WIDE = {"rows": 128, "columns": 256, "pixel_spacing_mm": (1.2, 0.6)}
+FINE = {"rows": 256, "columns": 256, "pixel_spacing_mm": (0.6, 0.6)}
+MASK = Intensity(kind="mask", polarity="bright", mm_per_count=None)
+
+
+def views(first, second):
+    return [carm(-30, -20, **first), carm(45, 25, **second)]
+
+
+@pytest.fixture(scope="module")
+def engine():
+    return Engine(threads=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shapes", [(TALL, TALL), (WIDE, WIDE), (TALL, WIDE)])
+@pytest.mark.parametrize("axis", [(0.0, 0.1, 1.0), (1.0, 0.1, -0.6)])
+@pytest.mark.parametrize("kind", ["path_length", "mask"])
+def test_a_tube_is_as_wide_as_it_is(engine, shapes, axis, kind):
+    tree, taken = straight(axis, radius=2.0), views(*shapes)
+    if kind == "path_length":
+        pictures = paths(tree, taken)
+    else:
+        pictures = [
+            angiogram(v, 255 * (path_of(tree, v) > 0), str(k), MASK, 8) for k, v in enumerate(taken)
+        ]
+    result = engine.reconstruct(pictures, GRID)
+    assert result.quality.status == "ok"
+    # A mask of every pixel that is touched is wider than the tube by up to half of a pixel.
+    within = 0.03 if kind == "path_length" else 0.2
+    assert abs(np.median(result.tree.radii()) / 2.0 - 1) < within
+    assert np.median(distances(result.tree, tree)[0]) < 0.15
+    for view, given in zip(result.views, taken, strict=True):
+        assert view.mask.shape == view.path_mm.shape == (given.rows, given.columns)
+        seen = path_of(tree, given) > 0.5
+        assert (view.mask & seen).sum() > 0.9 * seen.sum()
+        drawn = np.rint(given.project(result.tree.points())[0]).astype(int)
+        assert view.mask[drawn[:, 1], drawn[:, 0]].mean() > 0.95
+
+
+@pytest.mark.slow
+def test_a_tree_is_the_one_of_square_pixels(engine):
+    tree = seven()
+    square = engine.reconstruct(paths(tree, views(FINE, FINE)), GRID)
+    other = engine.reconstruct(paths(tree, views(TALL, WIDE)), GRID)
+    assert other.quality.status == square.quality.status
+    error, _ = distances(other.tree, tree)
+    assert np.median(error) < np.median(distances(square.tree, tree)[0]) + 0.1
+    assert other.tree.length_mm == pytest.approx(square.tree.length_mm, rel=0.05)
+
+
+@pytest.mark.parametrize("shape", [TALL, WIDE, {"principal_point_px": (50.0, 81.0)} | TALL])
+def test_points_and_what_is_drawn_go_with_the_pixels(shape):
+    view = carm(-30, -20, **shape)
+    points = np.random.default_rng(3).uniform(-30, 30, (20, 3))
+    rows, columns = square_shape(view)
+    new = view.resized(rows, columns)
+    assert abs(new.focal_px[0] / new.focal_px[1] - 1) < 1e-9
+    for old, there in zip(view.project(points)[0], new.project(points)[0], strict=True):
+        np.testing.assert_allclose(square_point(view, tuple(old)), there, atol=1e-9)
+    pixels = path_of(straight(), view)
+    picture = dataclasses.replace(
+        angiogram(view, pixels, "1"), mask=pixels > 0, painted=pixels > 3, bare=(pixels,)
+    )
+    done = squared(picture)
+    assert done.pixels.shape == done.mask.shape == done.painted.shape == (rows, columns)
+    off = done.pixels - path_of(straight(), new)
+    assert np.sqrt((off[done.mask] ** 2).mean()) < 0.4
+    # the same millimetres of vessel over the field
+    assert done.pixels.sum() == pytest.approx(2 * pixels.sum(), rel=1e-3)
+
+
+def test_square_pixels_stay_as_they_are():
+    picture = paths(straight())[0]
+    assert squared(picture) is picture
+    assert square_point(PAIR[0], (3.0, 4.0)) == (3.0, 4.0)
+    assert square_point(carm(0, **TALL), None) is None
+
+
+def test_very_long_pixels_make_no_picture_without_bounds():
+    rows, columns = square_shape(carm(0, rows=1000, columns=100, pixel_spacing_mm=(0.1, 10.0)))
+    assert rows * columns <= 2.1 * 1000 * 100
+    assert rows / columns == pytest.approx(1000 * 0.1 / (100 * 10.0), rel=0.02)
