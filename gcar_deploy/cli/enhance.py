@@ -73,6 +73,7 @@ def enhance(picture: Path, order: Order, meaning: Meaning, segmenter: str) -> No
     from gcar_deploy.imaging.extract import asked_network, extract_vessels
     from gcar_deploy.imaging.net import load_segmenter
     from gcar_deploy.imaging.pictures import png_files
+    from gcar_deploy.imaging.skeleton import arc_length
     from gcar_deploy.output.folder import write_folder
 
     out = check_target_of(dataclasses.replace(order, views=(picture,)))
@@ -92,7 +93,7 @@ def enhance(picture: Path, order: Order, meaning: Meaning, segmenter: str) -> No
         prefix = "net_" if (segmenter, who) == ("both", "net") else ""
         pictures |= {prefix + name: p for name, p in png_files(found).items()}
     write_folder(out, pictures, force=order.force)
-    length_mm = found.skeleton.sum() * found.carm.pixel_at_isocenter_mm
+    length_mm = float(arc_length(found.skeleton).sum()) * found.carm.pixel_at_isocenter_mm
     click.echo(
         f"{out}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "
         f"skeleton.png (about {length_mm:.0f} mm), steps.png ({found.catheter_mm:.0f} mm taken "

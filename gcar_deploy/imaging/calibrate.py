@@ -119,7 +119,7 @@ class _Sections:
             shadow=cv2.dilate(found.mask.astype(np.uint8), disc) > 0,
             label=skel.to_line(found.skeleton)[1],
             smooth_px=smooth,
-            length=enhance.wide_blur(_arc_length(found.skeleton), smooth),
+            length=enhance.wide_blur(skel.arc_length(found.skeleton), smooth),
             weight=enhance.wide_blur(found.skeleton.astype(np.float32), smooth),
         )
 
@@ -148,11 +148,3 @@ class _Sections:
         """Sum of values on the lines, each by its distance."""
         on_line = np.where(self.skeleton, values, np.float32(0))
         return enhance.wide_blur(on_line.astype(np.float32, copy=False), self.smooth_px)
-
-
-def _arc_length(skeleton: Mask) -> Image:
-    """(rows, cols) float32: pixels of line that each skeleton pixel stands for."""
-    half = np.array([[0.5**0.5, 0.5, 0.5**0.5], [0.5, 0, 0.5], [0.5**0.5, 0.5, 0.5**0.5]])
-    line = skeleton.astype(np.float32)
-    reach = cv2.filter2D(line, -1, half.astype(np.float32), borderType=cv2.BORDER_CONSTANT)
-    return line * np.clip(reach, 0.5, 2**0.5)

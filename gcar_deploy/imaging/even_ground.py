@@ -29,6 +29,10 @@ _AREA, _HALF_WIDTH = 0.3, 0.06
 _FLAT_SHARE, _NEARLY = 0.8, 0.9
 #: a smooth ground: degree of the surface along each axis, cells it is fitted to, rounds of the fit
 _DEGREE, _CELLS, _ROUNDS = 4, 32, 8
+#: of so many blocks a side, of whose pixels at most this percentage is vessel, at most so many may
+#: have a ground that is off by this share of what counts as vessel: a cloud that no smooth
+#: surface follows is no vessel, however narrow its top
+_BLOCKS, _BLOCK_VESSEL, _BLOCKS_OFF, _OFF_SHARE = 8, 75, 2, 0.5
 #: rows and columns that tell whether the ground is even
 _SAMPLES = 200
 #: grain is blurred by so much until the ground is even
@@ -73,7 +77,10 @@ def shadow(picture: Image, holes: Mask) -> Shadow | None:
             deepest = float(np.percentile(few, 99.9))
             spread = 1.4826 * float(np.median(np.abs(few)))
             if deepest > 0 and spread <= _SPREAD * deepest:
-                found = _of_rise(np.asarray(rise, np.float32), spread, deepest)
+                floor = max(_DEVIATIONS * spread, _LEAST * deepest)
+                if _blocks_off(np.where(seen, rise[::step, ::step], np.nan), floor):
+                    return None
+                found = _of_rise(np.asarray(rise, np.float32), floor, deepest)
                 return found and Shadow(*found, shaded=bool(shaded))
     return None
 
@@ -98,9 +105,20 @@ def _grounds(picture: Image, holes: Mask) -> Iterator[Array | float]:
     yield rows @ surface.reshape(_DEGREE + 1, _DEGREE + 1) @ columns.T
 
 
-def _of_rise(rise: Image, spread: float, deepest: float) -> tuple[Mask, bool] | None:
-    """Mask of what stands out, and whether it is flat; None where these are no lines."""
-    floor = max(_DEVIATIONS * spread, _LEAST * deepest)
+def _blocks_off(rise: Array, floor: float) -> bool:
+    """Whether the ground of some blocks lies higher or lower than that of the picture."""
+    grounds = [
+        np.percentile(inside, 100 - _BLOCK_VESSEL)
+        for band in np.array_split(rise, _BLOCKS)
+        for block in np.array_split(band, _BLOCKS, axis=1)
+        if (inside := block[np.isfinite(block)]).size > block.size // 2
+    ]
+    off = np.abs(np.asarray(grounds) - np.median(grounds)) if grounds else np.zeros(0)
+    return int((off > _OFF_SHARE * floor).sum()) > _BLOCKS_OFF
+
+
+def _of_rise(rise: Image, floor: float, deepest: float) -> tuple[Mask, bool] | None:
+    """Mask of what stands out by ``floor``, and whether it is flat; None where it is no lines."""
     if float((rise < -floor).mean()) > _OTHER_WAY:
         return None
     reach = rise > floor

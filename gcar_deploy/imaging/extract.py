@@ -233,11 +233,9 @@ def _from_mask(angiogram: Angiogram) -> VesselImage:
 def _from_drawn(angiogram: Angiogram, mask: Mask, least_mm: float = MIN_LENGTH_MM) -> VesselImage:
     line = skel.skeletonize(mask)
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
-    if line.sum() * pixel_mm < least_mm:
-        raise _nothing(
-            angiogram,
-            f"{line.sum() * pixel_mm:.0f} mm of line (needed: {least_mm:g} mm)",
-        )
+    length = float(skel.arc_length(line).sum()) * pixel_mm
+    if length < least_mm:
+        raise _nothing(angiogram, f"{length:.0f} mm of line (needed: {least_mm:g} mm)")
     return VesselImage(
         view_id=angiogram.view_id,
         carm=angiogram.carm,
@@ -321,7 +319,7 @@ def _lines(
             "view %s: %.0f mm of line taken for a catheter and left out",
             angiogram.view_id, found.catheter_mm,
         )  # fmt: skip
-    length = found.skeleton.sum() * pixel_mm
+    length = float(skel.arc_length(found.skeleton).sum()) * pixel_mm
     least = MIN_CONTRAST if segmenter is None else NET_MIN_CONTRAST
     too_faint = found.contrast < least or found.peak < MIN_PEAK
     too_faint &= angiogram.mask is None  # who draws a mask has seen the vessel

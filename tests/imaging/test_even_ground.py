@@ -108,6 +108,17 @@ def test_other_pictures_are_left_to_the_filters(what: str) -> None:
     assert shadow(picture.astype(np.float32), holes) is None
 
 
+@pytest.mark.parametrize("grain", [0.01, 0.06])
+@pytest.mark.parametrize("height", [-0.6, 0.3, 1.0])
+def test_a_hill_of_the_ground_is_no_vessel(height: float, grain: float) -> None:
+    picture, mask = drawn(True)
+    row, col = np.indices(picture.shape) / SIDE
+    hill = height * np.exp(-((col - 0.2) ** 2 + (row - 0.9) ** 2) / (2 * 0.2**2))
+    noise = np.random.default_rng(5).normal(0, grain, picture.shape)
+    found = shadow((picture + hill + noise).astype(np.float32), NO_HOLES)
+    assert found is None or (found.mask & ~mask).sum() < 0.1 * mask.sum()
+
+
 @pytest.mark.parametrize(("depth", "kind"), [(False, "mask"), (True, "raw")])
 @pytest.mark.parametrize("dark", [True, False])
 def test_a_drawn_tree_is_read_without_any_model(depth: bool, kind: str, dark: bool) -> None:

@@ -107,3 +107,11 @@ def test_thinning_is_that_of_opencv(seed):
     padded = cv2.copyMakeBorder(mask.astype(np.uint8) * 255, 2, 2, 2, 2, cv2.BORDER_CONSTANT)
     thin = cv2.ximgproc.thinning(padded, thinningType=cv2.ximgproc.THINNING_GUOHALL)
     np.testing.assert_array_equal(skel.skeletonize(mask), thin[2:-2, 2:-2] > 0)
+
+
+@pytest.mark.parametrize("end", [(60, 10), (10, 60), (60, 60), (60, 35)])
+def test_a_line_is_as_long_whichever_way_it_runs(end):
+    line = skel.skeletonize(_strokes([(10, 10), end], 1))
+    length = np.hypot(*(np.array(end) - 10))
+    # Steps of a line between the two diagonals are longer than the line by 8 % at most.
+    assert 0.97 * length < skel.arc_length(line).sum() < 1.1 * length
