@@ -173,6 +173,7 @@ class Reconstruction:
         )
         stills = tuple(pose.still(a) for pose, a in zip(poses, angiograms, strict=True))
         judged = tuple(self.quality.views[p] for p in places)
+        said = (p.note(a.view_id) for p, a in zip(poses, angiograms, strict=True))
         means = self.gaussians.means_mm + frame.origin_mm
         return dataclasses.replace(
             self,
@@ -180,6 +181,7 @@ class Reconstruction:
             tree=self.tree.moved(frame.origin_mm),
             gaussians=dataclasses.replace(self.gaussians, means_mm=means),
             grid=grid, angiograms=stills, views=views, poses=poses, options=options,
+            notes=(*self.notes, *filter(None, said)),
             close_calls=tuple(
                 dataclasses.replace(call, middle_mm=call.middle_mm + frame.origin_mm)
                 for call in self.close_calls

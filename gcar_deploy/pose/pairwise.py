@@ -43,6 +43,9 @@ from gcar_deploy.pose.profile_fit import (
 )
 from gcar_deploy.types import Array, Image, Pixels
 
+#: corrections from these on are said in words: more than a breath between two runs leaves, or
+#: than a gantry's display is off
+SAID_SHIFT_MM, SAID_TURN_DEG = 2.0, 1.0
 #: calibrated pictures that agree so well as they are told are left alone: pixels, not poses
 AGREED_CALIBRATED = 0.002
 
@@ -95,6 +98,15 @@ class Pose:
     def turn_deg(self) -> float:
         """The larger of the two angle corrections."""
         return max(abs(self.primary_deg), abs(self.secondary_deg))
+
+    def note(self, view: str) -> str | None:
+        """Return a large correction in words, for the view of that name; None of a small one."""
+        if self.shift_mm < SAID_SHIFT_MM and self.turn_deg < SAID_TURN_DEG:
+            return None
+        return (
+            f"view {view} was taken for moved by {self.shift_mm:.1f} mm and turned by "
+            f"{self.turn_deg:.1f} deg, so that it agrees with the others (--pose off: as told)"
+        )
 
     def at(self, theta: Array) -> Pose:
         """Return the pose with another (5,) correction."""

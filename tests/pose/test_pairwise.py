@@ -164,3 +164,12 @@ def test_blank_picture_and_switched_off():
     moved = pictures(moved=5 * plane_normal(*TOLD))
     off = estimate_poses(moved, PoseOptions(enabled=False))[1]
     assert off.offset_mm == (0, 0, 0) and off.before > 0.02
+
+
+def test_a_large_correction_is_said_in_words():
+    assert Pose().note("2") is None
+    assert Pose(offset_mm=(1.0, 1.0, 1.0), primary_deg=-0.9).note("2") is None
+    said = Pose(offset_mm=(2.0, 0.0, -2.0), secondary_deg=0.4).note("b")
+    assert said is not None
+    assert "view b" in said and "2.8 mm" in said and "0.4 deg" in said
+    assert "1.2 deg" in (Pose(primary_deg=-1.2).note("b") or "")
