@@ -6,7 +6,6 @@ import gzip
 import io
 import json
 import logging
-import re
 import shutil
 import struct
 import zipfile
@@ -20,11 +19,7 @@ from gcar_deploy.imaging.read import read_picture
 from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
 
 NAME, NUMBER, BORN = "ZZPATIENT^TEST", "ZZ-4711KV-ID", "19010203"
-#: a number is looked for as one: its digits may be part of a longer one, a time's or a point's
-CANARIES = {
-    text: re.compile(rb"(?<![0-9.])%b(?![0-9])" % re.escape(text.encode()))
-    for text in (NAME, NUMBER, BORN, "ZZPATIENT", "4711KV")
-}
+CANARIES = (NAME, NUMBER, BORN, "ZZPATIENT", "4711KV")
 
 
 def unpacked(name: str, data: bytes) -> bytes:
@@ -39,7 +34,7 @@ def unpacked(name: str, data: bytes) -> bytes:
 
 def hits(where: str, data: bytes | str) -> list[str]:
     text = data if isinstance(data, bytes) else data.encode("utf-8", "replace")
-    return [f"{canary} in {where}" for canary, seen in CANARIES.items() if seen.search(text)]
+    return [f"{canary} in {where}" for canary in CANARIES if canary.encode() in text]
 
 
 def in_folder(folder: Path) -> list[str]:
