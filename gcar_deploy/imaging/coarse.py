@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 
-import cv2
 import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.imaging.resample import resize
 from gcar_deploy.types import Image, Mask
 
 #: a picture is searched with at least so many pixels along its longer side, and fewer than twice
@@ -49,13 +49,13 @@ def as_fine(found: VesselImage, angiogram: Angiogram) -> VesselImage:
     return dataclasses.replace(
         found,
         carm=angiogram.carm,
-        path_mm=_between(found.path_mm, shape),
+        path_mm=resize(found.path_mm, shape[::-1]),
         mask=mask,
         skeleton=skel.skeletonize(mask),
         valid=inside(found.valid, shape),
-        vesselness=None if found.vesselness is None else _between(found.vesselness, shape),
+        vesselness=None if found.vesselness is None else resize(found.vesselness, shape[::-1]),
         catheter=catheter,
-        device=None if found.device is None else _between(found.device, shape),
+        device=None if found.device is None else resize(found.device, shape[::-1]),
         others=tuple(as_fine(other, angiogram) for other in found.others),
         kept=None if kept is None else lambda: as_fine(kept(), angiogram),
     )
@@ -70,15 +70,10 @@ def smaller(picture: Image, factor: int) -> Image:
     """Mean of a picture over pixels about ``factor`` times as large, a whole number of them."""
     rows, columns = picture.shape
     size = (max(1, columns // factor), max(1, rows // factor))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _between(picture: Image, shape: tuple[int, ...]) -> Image:
-    large = cv2.resize(picture, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(large, dtype=np.float32)
+    return resize(picture, size)
 
 
 def inside(mask: Mask, shape: tuple[int, ...]) -> Mask:
     """Pixels of a larger ``shape`` (rows, columns) whose centres lie in a coarser mask."""
-    covered: Mask = _between(mask.astype(np.float32), shape) > 0.5
+    covered: Mask = resize(mask.astype(np.float32), shape[::-1]) > 0.5
     return covered

@@ -28,6 +28,7 @@ from gcar_deploy.imaging.net import (
     at_network_size,
     net_input,
 )
+from gcar_deploy.imaging.resample import resize
 from gcar_deploy.types import Image, Mask
 
 #: hysteresis on the network's probability: what is faint counts where it touches what is sure
@@ -84,7 +85,7 @@ def learned_vessels(
     told = device_map(segmenter, fine, seen, line, reach, work_holes)
     device = devices(told, reach, line, work, work_holes)
     if "came" in pictures:
-        came = segment.resize(pictures["came"], work.shape[::-1]) > 0.5
+        came = resize(pictures["came"], work.shape[::-1]) > 0.5
         new = skel.beside(reach, line, skel.mostly(line, came))
         device, told = device & ~new, np.where(new, np.float32(0), told)
 
@@ -107,8 +108,8 @@ def _found(
     finer = float(np.sqrt(search.size / device.size))
     work_mm = np.float32(pixel_mm * finer)
     sure = support(seen, LEVELS)
-    near = (segment.resize(sure.astype(np.float32), full) >= 0.5) & ~holes
-    chord = np.where(near, segment.resize(seen.chord, full) * work_mm, np.float32(0))
+    near = (resize(sure.astype(np.float32), full) >= 0.5) & ~holes
+    chord = np.where(near, resize(seen.chord, full) * work_mm, np.float32(0))
     contrast = scaled_contrast(pictures["display"], holes, near, chord, pixel_mm)
     near = _with_contrast(near, chord, contrast, finer)
     path = np.where(near, contrast, np.float32(0))
@@ -117,10 +118,10 @@ def _found(
     device = device & ~sure
     found = dataclasses.replace(
         segment.given(search, mask, holes, pixel_mm),
-        vesselness=np.where(holes, np.float32(0), segment.resize(seen.probability, full)),
-        catheter=(segment.resize(device.astype(np.float32), full) >= 0.5) & ~mask,
+        vesselness=np.where(holes, np.float32(0), resize(seen.probability, full)),
+        catheter=(resize(device.astype(np.float32), full) >= 0.5) & ~mask,
         catheter_mm=int(skel.skeletonize(device).sum()) * float(work_mm),
-        device=segment.resize(told, full),
+        device=resize(told, full),
     )
     return found, path
 

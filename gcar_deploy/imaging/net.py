@@ -24,7 +24,7 @@ from gcar_deploy.config.ranges import check_choice
 from gcar_deploy.errors import ModelError
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.line_strips import NEAR, POINT, LinePoints
-from gcar_deploy.imaging.segment import resize
+from gcar_deploy.imaging.resample import resize
 from gcar_deploy.models import Kind, Session, read_model
 from gcar_deploy.types import Array, Image, Mask, Scalars
 

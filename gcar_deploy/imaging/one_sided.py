@@ -13,7 +13,8 @@ import numpy as np
 
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
-from gcar_deploy.imaging.segment import at_working_size, resize
+from gcar_deploy.imaging.resample import resize
+from gcar_deploy.imaging.segment import at_working_size
 from gcar_deploy.types import Image, Mask
 
 #: wider than any vessel, blur included: a disc of this radius finds room on the higher side, mm

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from scipy import sparse
 
@@ -53,6 +54,17 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
         catheter=catheter,
         device=None if device is None else area_average(device, rows, columns),
     )
+
+
+def resize(picture: Image, size: tuple[int, ...]) -> Image:
+    """Resample to (columns, rows): area average when shrinking, linear when growing."""
+    rows, columns = picture.shape
+    if size == (columns, rows):
+        return picture
+    shrink = size[0] < columns or size[1] < rows
+    interpolation = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+    size = (size[0], size[1])
+    return np.asarray(cv2.resize(picture, size, interpolation=interpolation), dtype=np.float32)
 
 
 def area_average(picture: Image, rows: int, columns: int) -> Image:

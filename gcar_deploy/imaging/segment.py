@@ -10,6 +10,7 @@ import numpy as np
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
+from gcar_deploy.imaging.resample import resize
 from gcar_deploy.types import Array, Image, Mask
 
 #: vessels are looked for at this pixel size (coarser pictures keep their own)
@@ -288,14 +289,3 @@ def _fill_specks(mask: Mask, largest_px: float) -> Mask:
     small = stats[:, cv2.CC_STAT_AREA] <= largest_px
     small[0] = False
     return mask | small[label]
-
-
-def resize(picture: Image, size: tuple[int, ...]) -> Image:
-    """Resample to (columns, rows): area average when shrinking, linear when growing."""
-    rows, columns = picture.shape
-    if size == (columns, rows):
-        return picture
-    shrink = size[0] < columns
-    interpolation = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
-    size = (size[0], size[1])
-    return np.asarray(cv2.resize(picture, size, interpolation=interpolation), dtype=np.float32)

@@ -224,12 +224,12 @@ def _carried(values: Array, skeleton: Mask, label: Array) -> Array:
     return table[label]
 
 
-_GOES = _rules()
-
-
 def arc_length(skeleton: Mask) -> Image:
     """(rows, cols) float32: pixels of line that each pixel stands for, whichever way it runs."""
     half = np.array([[0.5**0.5, 0.5, 0.5**0.5], [0.5, 0, 0.5], [0.5**0.5, 0.5, 0.5**0.5]])
     line = skeleton.astype(np.float32)
     reach = cv2.filter2D(line, -1, half.astype(np.float32), borderType=cv2.BORDER_CONSTANT)
     return line * np.clip(reach, 0.5, 2**0.5)
+
+
+_GOES = _rules()

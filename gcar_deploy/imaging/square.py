@@ -9,12 +9,11 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import cv2
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.resample import resized
+from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.resample import resize
 from gcar_deploy.types import Image, Mask
 
 #: sides that differ by less are equal: the radius of a vessel is off by half of that
@@ -70,18 +69,7 @@ def square_point(carm: CArm, point: tuple[float, float] | None) -> tuple[float, 
     )
 
 
-def as_taken(view: VesselImage, carm: CArm) -> VesselImage:
-    """Return what was found on square pixels on those of ``carm``, of the same field."""
-    if view.mask.shape == (carm.rows, carm.columns):
-        return view
-    return resized(view, carm.rows, carm.columns)
-
-
 def _resampled(picture: Image, shape: tuple[int, int]) -> Image:
-    """Means where pixels grow, linear between their middles where they shrink."""
-    for axis in (0, 1):
-        old, new = picture.shape[axis], shape[axis]
-        size = (picture.shape[1], new) if axis == 0 else (new, picture.shape[0])
-        way = cv2.INTER_AREA if new < old else cv2.INTER_LINEAR
-        picture = cv2.resize(picture, size, interpolation=way).astype(np.float32, copy=False)
-    return picture
+    """Resample to (rows, columns): one way may shrink while the other grows."""
+    rows, columns = shape
+    return resize(resize(picture, (picture.shape[1], rows)), (columns, rows))

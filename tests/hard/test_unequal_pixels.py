@@ -7,8 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gcar_deploy.config import RunOptions
 from gcar_deploy.engine import Engine
+from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.square import square_point, square_shape, squared
 from tests.hard.phantoms import (
     GRID,
@@ -18,6 +21,7 @@ from tests.hard.phantoms import (
     distances,
     path_of,
     paths,
+    raw,
     seven,
     straight,
 )
@@ -75,6 +79,17 @@ def test_a_tree_is_the_one_of_square_pixels(engine):
     assert other.tree.length_mm == pytest.approx(square.tree.length_mm, rel=0.05)
 
 
+@pytest.mark.slow
+def test_raw_pictures_come_back_on_their_own_pixels(engine):
+    tree, taken = straight((0.0, 0.1, 1.0), radius=2.0), views(TALL, WIDE)
+    result = engine.reconstruct(raw(tree, taken), GRID)
+    assert abs(np.median(result.tree.radii()) / 2.0 - 1) < 0.15
+    assert np.median(distances(result.tree, tree)[0]) < 0.3
+    for view, given in zip(result.views, taken, strict=True):
+        for found in (view.mask, view.valid, view.vesselness, view.device):
+            assert found is None or found.shape == (given.rows, given.columns)
+
+
 @pytest.mark.parametrize("shape", [TALL, WIDE, {"principal_point_px": (50.0, 81.0)} | TALL])
 def test_points_and_what_is_drawn_go_with_the_pixels(shape):
     view = carm(-30, -20, **shape)
@@ -94,6 +109,20 @@ def test_points_and_what_is_drawn_go_with_the_pixels(shape):
     assert np.sqrt((off[done.mask] ** 2).mean()) < 0.4
     # the same millimetres of vessel over the field
     assert done.pixels.sum() == pytest.approx(2 * pixels.sum(), rel=1e-3)
+
+
+def test_marks_stay_on_what_they_mark():
+    taken = views(TALL, WIDE)
+    place = np.array([[4.0, -7.0, 12.0]])
+    marked = tuple(tuple(v.project(place)[0][0].tolist()) for v in taken)
+    frame = own_frame(taken, "ab")
+    pictures, options = in_own_frame(
+        frame, paths(straight(), taken), RunOptions(landmarks=(marked, (marked[0], None)))
+    )
+    for number, picture in enumerate(pictures):
+        there = picture.carm.project(place - frame.origin_mm)[0][0]
+        np.testing.assert_allclose(options.landmarks[0][number], there, atol=1e-3)
+    assert options.landmarks[1][frame.place(1)] is None
 
 
 def test_square_pixels_stay_as_they_are():

@@ -14,7 +14,7 @@ from gcar_deploy.imaging.extract import (
     extract_vessels,
 )
 from gcar_deploy.imaging.polarity import with_polarity
-from gcar_deploy.imaging.resample import area_average, coarsened, resized
+from gcar_deploy.imaging.resample import area_average, coarsened, resize, resized
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
 
@@ -60,6 +60,17 @@ def test_a_users_mask_cuts_a_mask_and_keeps_the_brightness_of_a_picture():
     grey = dataclasses.replace(angiogram(raw_picture(truth, gain=0.06)), mask=truth > 0.5)
     found = extract_vessels(grey, _OPTIONS)
     assert found.kind == "raw" and found.path_error == CONTRAST_ERROR
+
+
+@pytest.mark.parametrize("slope", [0.0, 1.0, -1.0])
+def test_a_short_vessel_is_as_long_whichever_way_it_runs(slope):
+    row, col = PIXEL_MM * (np.indices((256, 256)) - 127.5)
+    along, off = (np.array([col + slope * row, row - slope * col])) / np.hypot(1, slope)
+    wide = np.abs(off) < 1.0
+    long_enough = angiogram(wide & (np.abs(along) < 15), "mask")  # 30 mm
+    np.testing.assert_array_equal(extract_vessels(long_enough, _OPTIONS).mask, long_enough.pixels)
+    with pytest.raises(RefusedError, match="mm of line"):
+        extract_vessels(angiogram(wide & (np.abs(along) < 11), "mask"), _OPTIONS)
 
 
 def test_masks_need_no_network():
@@ -209,6 +220,21 @@ def test_resized_keeps_the_mass_and_the_line(shape):
         old.path_mm.sum(dtype=np.float64), rel=1e-5
     )
     assert new.skeleton.any() and not (new.skeleton & ~new.mask).any()
+
+
+def test_one_way_may_shrink_alone():
+    picture = np.random.default_rng(4).random((60, 40)).astype(np.float32)
+    means = picture.reshape(20, 3, 40).mean(axis=1)
+    np.testing.assert_allclose(resize(picture, (40, 20)), means, atol=1e-6)
+    np.testing.assert_allclose(resize(picture.T.copy(), (20, 40)), means.T, atol=1e-6)
+
+
+def test_all_of_a_view_is_resized():
+    view = extract_vessels(angiogram(tube_paths() > 0.5, "mask"), _OPTIONS)
+    told = dataclasses.replace(view, device=view.path_mm / 9, catheter=view.mask)
+    small = resized(told, 128, 64)
+    assert small.device is not None and small.catheter is not None
+    np.testing.assert_allclose(small.device, small.path_mm / 9, atol=1e-6)
 
 
 def test_area_average_by_a_whole_factor_is_the_block_mean():
