@@ -37,6 +37,9 @@ _BLOCKS, _BLOCK_VESSEL, _BLOCKS_OFF, _OFF_SHARE = 8, 75, 2, 0.5
 _SAMPLES = 200
 #: grain is blurred by so much until the ground is even
 _BLURS_PX = (0.0, 1.0, 2.0)
+#: so near to what stands out, pixels, the ground of a line stands out by less than this share of
+#: the line itself; speckles on a cloud's top have the cloud beside them
+_BESIDE_PX, _BESIDE_SHARE = 4, 0.4
 #: middles are averaged over so much of the line, pixels
 _ALONG_PX = 3.0
 
@@ -117,6 +120,22 @@ def _blocks_off(rise: Array, floor: float) -> bool:
     return int((off > _OFF_SHARE * floor).sum()) > _BLOCKS_OFF
 
 
+def _on_ground(line: Mask, reach: Mask, rise: Image) -> Mask:
+    """Leave out connected lines without ground beside them: speckles on the top of a cloud."""
+    count, part = cv2.connectedComponents(line.astype(np.uint8), connectivity=8)
+    near = cv2.dilate(reach.astype(np.uint8), np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)) > 0
+    ring = near & ~reach
+    beside = skel.nearest(part, line)[ring]
+    ground, deep = (
+        np.bincount(of, rise[at], count) / np.bincount(of, minlength=count).clip(1)
+        for of, at in ((beside, ring), (part[line], line))
+    )
+    kept = ground < _BESIDE_SHARE * deep
+    kept[0] = False
+    out: Mask = kept[part]
+    return out
+
+
 def _of_rise(rise: Image, floor: float, deepest: float) -> tuple[Mask, bool] | None:
     """Mask of what stands out by ``floor``, and whether it is flat; None where it is no lines."""
     if float((rise < -floor).mean()) > _OTHER_WAY:
@@ -127,7 +146,9 @@ def _of_rise(rise: Image, floor: float, deepest: float) -> tuple[Mask, bool] | N
     wide = half_width.max() > _HALF_WIDTH * min(rise.shape)
     if not line.any() or reach.mean() > _AREA or wide:
         return None
-    kept = skel.strong_parts(line, rise, PART_SHARE)
+    kept = skel.strong_parts(_on_ground(line, reach, rise), rise, PART_SHARE)
+    if not kept.any():
+        return None
     _, (peak,) = skel.spread(line, (rise,), _ALONG_PX)
     mask = ((rise > RIM_SHARE * peak) | kept) & skel.beside(reach, line, kept)
     dark = rise[mask] >= _NEARLY * deepest

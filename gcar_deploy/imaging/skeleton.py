@@ -217,6 +217,11 @@ def to_line(skeleton: Mask) -> tuple[Array, Array]:
     )
 
 
+def nearest(values: Array, skeleton: Mask) -> Array:
+    """(rows, cols) value at the nearest skeleton pixel."""
+    return _carried(values, skeleton, to_line(skeleton)[1])
+
+
 def _carried(values: Array, skeleton: Mask, label: Array) -> Array:
     """(rows, cols) value at the nearest skeleton pixel; ``label`` as ``_to_line`` numbers them."""
     table = np.zeros(int(label.max()) + 1, values.dtype)

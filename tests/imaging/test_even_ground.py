@@ -119,6 +119,18 @@ def test_a_hill_of_the_ground_is_no_vessel(height: float, grain: float) -> None:
     assert found is None or (found.mask & ~mask).sum() < 0.1 * mask.sum()
 
 
+@pytest.mark.parametrize(("height", "width"), [(0.08, 25), (0.1, 15)])
+def test_speckles_on_the_top_of_a_low_cloud_are_no_vessel(height: float, width: float) -> None:
+    picture, mask = drawn(True)
+    row, col = np.indices(picture.shape)
+    cloud = height * np.exp(-((row / width) ** 2 + ((col - 100) / 60) ** 2) / 2)
+    noise = np.random.default_rng(2).normal(0, 0.01, picture.shape)
+    found = shadow((picture + cloud + noise).astype(np.float32), NO_HOLES)
+    assert found is not None
+    assert (found.mask & ~mask).sum() < 20
+    assert dice(found.mask, mask) > 0.95
+
+
 @pytest.mark.parametrize(("depth", "kind"), [(False, "mask"), (True, "raw")])
 @pytest.mark.parametrize("dark", [True, False])
 def test_a_drawn_tree_is_read_without_any_model(depth: bool, kind: str, dark: bool) -> None:
