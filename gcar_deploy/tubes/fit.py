@@ -6,7 +6,6 @@ Last of all it states sigma.
 from __future__ import annotations
 
 import dataclasses
-import heapq
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -32,20 +31,16 @@ from gcar_deploy.tubes.gauss_newton import (
     rescaled,
 )
 from gcar_deploy.tubes.hessian import seen_by
-from gcar_deploy.tubes.missed import Proposal, Told, looked_at, missed_lines, proposal
-from gcar_deploy.tubes.model import Footprint, Tubes, tubes_of
-from gcar_deploy.tubes.prior import TAPER_PIXEL_MM, Prior, make_prior
+from gcar_deploy.tubes.model import tubes_of
+from gcar_deploy.tubes.prior import TAPER_PIXEL_MM
 from gcar_deploy.tubes.radius_refit import refit_radii
+from gcar_deploy.tubes.run import Run, State, coarsest_pixel_mm, started_at, tree_of
 from gcar_deploy.tubes.settle import settled
 from gcar_deploy.tubes.support import grown_tree, seen_share, supported_tree, unexplained
 from gcar_deploy.tubes.targets import Target, make_targets
+from gcar_deploy.tubes.topology import settled_topology
 from gcar_deploy.tubes.uncertainty import spread
 from gcar_deploy.types import Array, Scalars
-
-#: a vessel that was missed is kept where it lowers the objective by this share ...
-EARNED = 0.005
-#: ... and, where paths are estimates and a line may be background, by so much per mm of it
-EARNED_PER_MM = 0.3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,53 +103,23 @@ def fit_tubes(
     )
     if not tree.branches:
         return fit
-    return _fitted(fit, views, _Run(options, progress, should_stop, evidence))
+    return _fitted(fit, views, Run(options, progress, should_stop, evidence))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Run:
-    """What every stage of one fit shares."""
-
-    options: TubeOptions
-    progress: Progress
-    should_stop: Callable[[], bool] | None
-    evidence: CenterPoints | None
-
-    def fit(self, tree: Tree, targets: list[Target], steps: int) -> _State:
-        """Fit from where the tree is now."""
-        tubes, prior = _start(tree, self.options, _pixel_mm(targets))
-        prints: list[Footprint] = []
-        if tree.branches:
-            tubes, prints = fit_level(
-                tubes, targets, prior, self.options, steps, self.progress, self.should_stop
-            )
-        return _State(tree_of(tubes, tree), tubes, prior, prints)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _State:
-    """A tree, its tubes, the prior round its start, and where the tubes fall in each view."""
-
-    tree: Tree
-    tubes: Tubes
-    prior: Prior
-    prints: list[Footprint]
-
-
-def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
+def _fitted(start: TubeFit, views: Sequence[VesselImage], run: Run) -> TubeFit:
     options, progress = run.options, run.progress
     targets: list[Target] = []
     start_radius = start.tree.radii()
-    now = _State(start.tree, *_start(start.tree, options), [])
+    now = State(start.tree, *started_at(start.tree, options), [])
     for number, (level, steps) in enumerate(zip(options.levels_mm, options.steps, strict=True)):
         if number and (progress.stopped or progress.failed):
             break
         targets = _contrasts(make_targets(views, level, options), targets)
-        prior = now.prior.at_pixel(_pixel_mm(targets), options)
+        prior = now.prior.at_pixel(coarsest_pixel_mm(targets), options)
         tubes, prints = fit_level(
             now.tubes, targets, prior, options, steps, progress, run.should_stop
         )
-        now = _State(tree_of(tubes, now.tree), tubes, prior, prints)
+        now = State(tree_of(tubes, now.tree), tubes, prior, prints)
         if number or len(options.levels_mm) == 1:
             continue
         if len(targets) > 1:
@@ -168,7 +133,7 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     if not now.tree.branches:
         return dataclasses.replace(start, tree=now.tree, contrast=contrast)
     if not (options.levels_mm[-1] or progress.stopped or progress.failed):
-        now = _with_missed(now, views, targets, run)
+        now = settled_topology(now, views, targets, run)
         now = _with_refitted_radii(now, targets, options)
     targets = rescaled(targets, now.prints)
     own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
@@ -185,69 +150,12 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: _Run) -> TubeFit:
     )
 
 
-def _with_missed(
-    now: _State, views: Sequence[VesselImage], targets: list[Target], run: _Run
-) -> _State:
-    """Add the lines that no tube explains, the likeliest first, each where it earns its place."""
-    if run.evidence is None or len(views) < 2:
-        return now
-    looks = looked_at(views, rescaled(targets, now.prints), now.prints)
-    lines = missed_lines(looks)
-    if not lines:
-        return now
-    told = Told.by(run.evidence)
-    # Costs are of the tree as it was when they were found: of a later one they are asked once more.
-    queue: list[tuple[float, int, Proposal | None, _State | None]] = [
-        (-np.inf, number, None, None) for number in range(len(lines))
-    ]
-    least: float | None = None
-    while queue:
-        _, number, found, of = heapq.heappop(queue)
-        if found is None or of is not now:
-            found = proposal(lines[number], looks, now.tree, told)
-            if found is not None:
-                heapq.heappush(queue, (found.cost, number, found, now))
-            continue
-        if least is None:
-            # What it must beat has had as many steps, from as near a start.
-            least = _tried(now.tree, targets, run)[1].losses[-1]
-        trial, progress = _tried(found.added(now.tree), targets, run)
-        if progress.stopped:
-            run.progress.stopped = True
-            break
-        price = EARNED * least
-        if not all(target.calibrated for target in targets):
-            price = max(price, EARNED_PER_MM * (trial.tree.length_mm - now.tree.length_mm))
-        if progress.losses[-1] < least - price:
-            now, least = trial, progress.losses[-1]
-            run.progress.follow(progress)
-            looks = looked_at(views, rescaled(targets, now.prints), now.prints)
-    return now
-
-
-def _tried(tree: Tree, targets: list[Target], run: _Run) -> tuple[_State, Progress]:
-    """Fit at the last level without a trace in what the run has done so far."""
-    aside = dataclasses.replace(run, progress=Progress())
-    return aside.fit(tree, targets, run.options.steps[-1]), aside.progress
-
-
-def _with_refitted_radii(now: _State, targets: list[Target], options: TubeOptions) -> _State:
+def _with_refitted_radii(now: State, targets: list[Target], options: TubeOptions) -> State:
     """Refit the radii where the pixels are fine enough to show a narrow core."""
-    if _pixel_mm(targets) >= TAPER_PIXEL_MM:
+    if coarsest_pixel_mm(targets) >= TAPER_PIXEL_MM:
         return now
     tubes, prints = refit_radii(now.tubes, targets, now.prints, options)
-    return _State(tree_of(tubes, now.tree), tubes, now.prior, prints)
-
-
-def _pixel_mm(targets: Sequence[Target]) -> float:
-    """Coarsest pixel at the isocentre, mm."""
-    return max(target.pixel_mm for target in targets)
-
-
-def _start(tree: Tree, options: TubeOptions, pixel_mm: float = np.inf) -> tuple[Tubes, Prior]:
-    tubes = tubes_of(tree)
-    trust = np.concatenate([np.zeros(0), *(branch.confidence for branch in tree.branches)])
-    return tubes, make_prior(tubes, trust, options, pixel_mm)
+    return State(tree_of(tubes, now.tree), tubes, now.prior, prints)
 
 
 def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
@@ -260,8 +168,8 @@ def _contrasts(targets: list[Target], before: list[Target]) -> list[Target]:
 
 
 def _chosen(
-    now: _State, start_radius: Scalars, targets: list[Target], run: _Run
-) -> tuple[_State, tuple[CloseCall, ...]]:
+    now: State, start_radius: Scalars, targets: list[Target], run: Run
+) -> tuple[State, tuple[CloseCall, ...]]:
     """Drop ghosts, fit the rest, and take back what every view then misses."""
     options, tree = run.options, now.tree
     targets = rescaled(targets, now.prints)
@@ -278,7 +186,7 @@ def _chosen(
     return kept, close_calls(tree, back)
 
 
-def _supported(now: _State, targets: list[Target]) -> Tree:
+def _supported(now: State, targets: list[Target]) -> Tree:
     """Cut what the pictures do not show, then grow along what the tree does not explain."""
     targets = rescaled(targets, now.prints)
     share = seen_share(now.tubes, targets, now.prints)
@@ -289,18 +197,7 @@ def _supported(now: _State, targets: list[Target]) -> Tree:
     return grown_tree(tree, targets, left)
 
 
-def tree_of(tubes: Tubes, tree: Tree) -> Tree:
-    """Return ``tree`` with the positions and radii of ``tubes``, which was made from it."""
-    points, radii = tubes.points_mm, tubes.radius_mm
-    branches = []
-    for k, branch in enumerate(tree.branches):
-        own = tubes.point_branch == k
-        branches.append(dataclasses.replace(branch, points_mm=points[own], radius_mm=radii[own]))
-    nodes = tubes.positions_mm[: len(tree.nodes_mm)]
-    return dataclasses.replace(tree, nodes_mm=nodes, branches=tuple(branches))
-
-
-def with_sigma(now: _State, targets: list[Target], options: TubeOptions) -> Tree:
+def with_sigma(now: State, targets: list[Target], options: TubeOptions) -> Tree:
     """Return the tree with covariance and sigma per point."""
     tree, tubes = now.tree, now.tubes
     views = [

@@ -12,8 +12,9 @@ from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import footprints
-from gcar_deploy.tubes.missed import Told, looked_at, missed_lines, proposal
+from gcar_deploy.tubes.missed import looked_at, missed_lines
 from gcar_deploy.tubes.model import tubes_of
+from gcar_deploy.tubes.proposal import Told, proposal
 from gcar_deploy.tubes.targets import make_targets
 from tests.tree.shapes import branch, fork, grid, points_of
 from tests.tubes.scenes import carm, seen, two_views
@@ -85,8 +86,9 @@ def test_a_line_of_one_picture_alone_is_no_vessel():
 def test_of_two_places_the_predictor_says_which(told):
     truth, known, line = _with_twig()
     one, two = two_views()
-    # What lies before it on the same rays of the first view is shown by the second alone.
-    before = line + 0.012 * (one.source_mm - line)
+    # What runs before it on the same rays of the first view is shown by the second alone.
+    nearer = np.linspace(0.0, 0.015, len(line))[:, None]
+    before = line + nearer * (one.source_mm - line)
     both = with_branch(truth, before, 0.8, 1.0, 0.5)
     views = [*_pictures(truth, [one]), *_pictures(both, [two])]
     where = grid(64)
@@ -104,7 +106,7 @@ def test_what_lowers_the_objective_too_little_is_left_out(monkeypatch):
     truth, known, line = _with_twig()
     where = grid(64)
     views = _pictures(truth, two_views())
-    monkeypatch.setattr("gcar_deploy.tubes.fit.EARNED", 0.95)
+    monkeypatch.setattr("gcar_deploy.tubes.topology.EARNED", 0.95)
     found = fit_tubes(
         points_of(known, where), views, OPTIONS, evidence=_believed(truth, where, 0.3)
     )
@@ -130,7 +132,7 @@ def test_where_paths_are_estimates_each_mm_has_a_price(calibrated, monkeypatch):
     truth, known, line = _with_twig()
     where = grid(64)
     views = _pictures(truth, two_views(), calibrated=calibrated)
-    monkeypatch.setattr("gcar_deploy.tubes.fit.EARNED_PER_MM", 100.0)
+    monkeypatch.setattr("gcar_deploy.tubes.topology.EARNED_PER_MM", 100.0)
     found = fit_tubes(
         points_of(known, where), views, OPTIONS, evidence=_believed(truth, where, 0.3)
     )
@@ -199,8 +201,8 @@ def test_what_tubes_explain_now_is_no_proposal_and_in_other_views_costs_more(mon
     # The vessel that would be there is explained by something else: nothing of it is new.
     taken = _looks(views, known, truth)
     assert proposal(line, taken, known, told) is None
-    monkeypatch.setattr("gcar_deploy.tubes.missed.LEAST_NEW", 0.0)
-    monkeypatch.setattr("gcar_deploy.tubes.missed.MOST_COST", 9.0)
+    monkeypatch.setattr("gcar_deploy.tubes.proposal.LEAST_NEW", 0.0)
+    monkeypatch.setattr("gcar_deploy.tubes.proposal.MOST_COST", 9.0)
     assert proposal(line, taken, known, told).cost > free.cost + 0.5
 
 
