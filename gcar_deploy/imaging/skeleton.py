@@ -20,7 +20,7 @@ def skeletonize(mask: Mask) -> Mask:
     ``cv2.ximgproc.thinning`` does too, which looks at the whole picture for every layer that goes.
     Here a pixel is looked at again only where one beside it went.
     """
-    here = np.pad(mask, 1)
+    here = np.ascontiguousarray(np.pad(mask, 1))
     ring = np.array([-1, -1, 0, 1, 1, 1, 0, -1]) * here.shape[1]  # clockwise from above
     ring += np.array([0, 1, 1, 1, 0, -1, -1, -1])
     on = here.reshape(-1)

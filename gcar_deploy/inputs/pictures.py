@@ -255,7 +255,8 @@ def _from_array(
         raise ImageError(f"view {view_id}: grey values must be finite and not negative")
     sha256 = hashlib.sha256(f"{array.dtype.name}{array.shape}".encode())
     sha256.update(np.ascontiguousarray(array).tobytes())
-    return array.astype(np.float32), depth, sha256.hexdigest()
+    # Columns first in memory is the same picture: what follows looks at rows.
+    return array.astype(np.float32, order="C"), depth, sha256.hexdigest()
 
 
 def _scene(geometry: Geometry) -> Scene:

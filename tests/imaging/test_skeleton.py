@@ -115,3 +115,11 @@ def test_a_line_is_as_long_whichever_way_it_runs(end):
     length = np.hypot(*(np.array(end) - 10))
     # Steps of a line between the two diagonals are longer than the line by 8 % at most.
     assert 0.97 * length < skel.arc_length(line).sum() < 1.1 * length
+
+
+def test_the_order_in_memory_changes_nothing():
+    mask = np.zeros((40, 60), bool)
+    mask[10:20, 15:45] = True
+    line = skel.skeletonize(mask)
+    assert line.sum() < 60
+    np.testing.assert_array_equal(skel.skeletonize(np.asfortranarray(mask)), line)
