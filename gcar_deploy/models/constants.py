@@ -128,12 +128,15 @@ def _computed(node: Node, known: Mapping[str, Constant], most: int) -> Constant:
         return Constant(8)
     if node.operator == "MatMul" and len(inputs) == 2:
         a, b = inputs[0].dims or (), inputs[1].dims or ()
-        if len(a) == len(b) == 2:
-            return Constant(a[0] * b[1], (a[0], b[1]))
+        if 1 <= len(a) <= 2 and 1 <= len(b) <= 2:
+            dims = a[:-1] + b[1:]
+            return Constant(math.prod(dims), dims)
     return Constant(math.prod(max(one.elements, 1) for one in inputs))
 
 
 def _broadcast(inputs: Sequence[Constant]) -> Constant:
+    if inputs and all(one is inputs[0] for one in inputs):  # one shape, known or not
+        return Constant(inputs[0].elements, inputs[0].dims)
     shapes = [one.dims for one in inputs if one.dims is not None]
     if len(shapes) < len(inputs):
         return Constant(math.prod(max(one.elements, 1) for one in inputs))

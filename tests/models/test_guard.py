@@ -324,10 +324,7 @@ def test_no_constant_is_larger_than_reckoned(data):
         (found,) = ReferenceEvaluator(whole).run(None, {})
     except Exception:  # noqa: BLE001 - shapes that do not fit together
         return
-    try:
-        check_onnx(whole.SerializeToString(), ModelLimits())
-    except ValueError as error:  # bounds of unknown shapes multiply: reckoned too large, not small
-        assert "more than" in str(error)
+    check_onnx(whole.SerializeToString(), ModelLimits())
     known = {name: Constant(v.size, v.shape, tuple(v.ravel())) for name, v in weights.items()}
     nodes = [Node(n.op_type, tuple(n.input), tuple(n.output)) for n in steps]
     with pytest.raises(ValueError, match="more than"):
