@@ -185,7 +185,7 @@ def beside(reach: Mask, skeleton: Mask, kept: Mask) -> Mask:
     if not kept.any():
         return np.zeros_like(reach)
     near = cv2.dilate(kept.astype(np.uint8), _BLOCK) > 0
-    return reach & _carried(near, skeleton, to_line(skeleton)[1])
+    return reach & nearest(near, skeleton)
 
 
 def beside_alone(reach: Mask, skeleton: Mask, part: Mask) -> Mask:

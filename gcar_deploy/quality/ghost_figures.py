@@ -125,7 +125,7 @@ def ghost_figures(shown: Shown, evidence: Evidence, stretches: Stretches) -> Arr
     elsewhere, unclaimed = _on_rays(shown, evidence, stretches)
     seen, alone = _in_pictures(shown, stretches)
     lengths = np.array([branch.length_mm for branch in tree.branches])
-    component = tree.components()[[branch.start for branch in tree.branches]]
+    component = tree.parts()
     hanging = np.bincount(component, lengths)[component] / lengths.sum()
     loose = [int((tree.degrees[[b.start, b.end]] == 1).sum()) for b in tree.branches]
     tangents = np.concatenate([branch.tangents for branch in tree.branches])

@@ -249,8 +249,7 @@ def _pieces(tree: Tree) -> str:
 
 def part_lengths_mm(tree: Tree) -> tuple[float, ...]:
     """Vessel length in each connected part of a tree, the longest first, mm."""
-    part = tree.components()[[branch.start for branch in tree.branches]]
-    lengths = np.bincount(part, [branch.length_mm for branch in tree.branches])
+    lengths = tree.part_lengths_mm()
     return tuple(sorted(lengths[lengths > 0].tolist(), reverse=True))
 
 

@@ -139,6 +139,17 @@ class Tree:
                 break
         return np.unique(label, return_inverse=True)[1]
 
+    def parts(self) -> Array:
+        """(b,) connected component of each branch, numbered as those of the nodes."""
+        starts = np.array([branch.start for branch in self.branches], np.int64)
+        out: Array = self.components()[starts]
+        return out
+
+    def part_lengths_mm(self) -> Scalars:
+        """(c,) vessel length in each connected component, mm."""
+        lengths = np.array([branch.length_mm for branch in self.branches])
+        return np.bincount(self.parts(), lengths).astype(np.float64)
+
 
 def empty_tree() -> Tree:
     """Return a tree without a branch."""

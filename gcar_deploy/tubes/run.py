@@ -27,6 +27,24 @@ class State:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Trial:
+    """A tree that was fitted on trial, and how that went."""
+
+    state: State
+    progress: Progress
+
+    @property
+    def tree(self) -> Tree:
+        """Return the fitted tree."""
+        return self.state.tree
+
+    @property
+    def loss(self) -> float:
+        """Return the objective at the end of the fit."""
+        return self.progress.losses[-1]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Run:
     """What every stage of one fit shares."""
 
@@ -45,10 +63,12 @@ class Run:
             )
         return State(tree_of(tubes, tree), tubes, prior, prints)
 
-    def tried(self, tree: Tree, targets: list[Target]) -> tuple[State, Progress]:
-        """Fit at the last level without a trace in what the run has done so far."""
+    def tried(self, tree: Tree, targets: list[Target]) -> Trial:
+        """Fit at the last level; of that the run remembers no more than that it was stopped."""
         aside = dataclasses.replace(self, progress=Progress())
-        return aside.fit(tree, targets, self.options.steps[-1]), aside.progress
+        state = aside.fit(tree, targets, self.options.steps[-1])
+        self.progress.stopped |= aside.progress.stopped
+        return Trial(state, aside.progress)
 
 
 def started_at(tree: Tree, options: TubeOptions, pixel_mm: float = np.inf) -> tuple[Tubes, Prior]:

@@ -1,12 +1,20 @@
 """Parts of a tree that hang on nothing."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+from skimage.morphology import skeletonize
 
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import empty_tree
+from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.topology import _hanging, loose_mm
-from tests.tree.shapes import fork
+from tests.tree.shapes import fork, grid, points_of
+from tests.tubes.scenes import seen, two_views
 
 
 def _with_part(length_mm):
@@ -32,3 +40,45 @@ def test_a_short_part_stays():
 
 def test_no_tree_has_no_part():
     assert loose_mm(empty_tree()) == 0.0
+
+
+def _exchanged():
+    """Two like vessels side by side that cross the same planes, and with exchanged partners."""
+    carms = two_views()
+    across = plane_normal(*carms)
+    rays = [-one.source_mm / np.linalg.norm(one.source_mm) for one in carms]
+    apart = 12.0 * (rays[0] + rays[1])
+    away = np.arange(0.0, 26.0)[:, None] * across
+    link = np.linspace(0.0, 1.0, 30)[:, None] * apart - 15.0 * across
+    low = away[:16] - 15.0 * across
+    known = empty_tree()
+    for line in (link, low, low + apart):
+        known = with_branch(known, line, 1.0, 1.0, 0.5)
+    truth, ghosts = known, known
+    # One vessel's ray in the first view met with the other's in the second, and the other way.
+    for place in (0.0 * apart, apart):
+        truth = with_branch(truth, away + place, 1.0, 1.0, 0.5)
+    for ray in rays:
+        ghosts = with_branch(ghosts, away[3:] + 12.0 * ray, 1.0, 1.0, 0.5)
+    return truth, ghosts, carms
+
+
+def test_vessels_with_exchanged_partners_hang_on_the_tree_again(monkeypatch):
+    truth, ghosts, carms = _exchanged()
+    views = [
+        dataclasses.replace(view, skeleton=skeletonize(view.mask))
+        for view in seen(truth, carms, calibrated=False)
+    ]
+    where, both = grid(100), truth
+    for ghost in ghosts.branches[-2:]:
+        both = with_branch(both, ghost.points_mm, 1.0, 1.0, 0.5)
+    start, told = points_of(ghosts, where), points_of(both, where)
+    told = dataclasses.replace(told, confidence=0.5 * told.confidence)
+    found = fit_tubes(start, views, TubeOptions(), evidence=told).tree
+    assert loose_mm(found) == 0.0
+    assert cKDTree(truth.points()).query(found.points())[0].max() < 1.5
+    assert cKDTree(found.points()).query(truth.points())[0].max() < 1.5
+    monkeypatch.setattr("gcar_deploy.tubes.topology.LEAST_LOOSE_MM", np.inf)
+    left = fit_tubes(start, views, TubeOptions(), evidence=told).tree
+    assert loose_mm(left) > 40.0
+    assert cKDTree(truth.points()).query(left.points())[0].max() > 10.0
