@@ -53,3 +53,13 @@ class NumericalError(GcarError):
     """The computation left the finite numbers and could not be brought back."""
 
     exit_code = 8
+
+
+#: what libraries say, in errors that are no MemoryError, of memory that the system does not give
+_NO_MEMORY = ("can't start new thread", "Failed to allocate memory", "bad_alloc", "bad allocation",
+              "Insufficient memory")  # fmt: skip
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Tell whether an error says that memory ran out, whichever library raised it."""
+    return isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY)

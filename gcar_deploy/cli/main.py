@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _run(arguments: list[str], verbose: bool) -> int:
-    from gcar_deploy.errors import GcarError
+    from gcar_deploy.errors import GcarError, out_of_memory
 
     try:
         out: Any = gcar.main(arguments, prog_name="gcar", standalone_mode=False)
@@ -134,11 +134,13 @@ def _run(arguments: list[str], verbose: bool) -> int:
         # The reader of stdout went away; keep Python from complaining once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
-    except MemoryError:
-        return _fail("out of memory; use a smaller volume or smaller pictures", INTERNAL)
     except Exception as error:
         if (stopped := _stopped(error)) is not None:
             return _fail(*stopped)
+        if out_of_memory(error):
+            return _fail("out of memory; use a smaller volume or smaller pictures", INTERNAL)
+        if isinstance(error, OSError):
+            return _fail(f"{error.filename or 'cannot write'}: {error.strerror or error}", INTERNAL)
         # The last line of defence: never a traceback.
         if verbose:
             logging.getLogger("gcar_deploy").exception("internal error")

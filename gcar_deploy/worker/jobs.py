@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import gc
 import logging
 import secrets
 import threading
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.errors import CancelledError, GcarError, RefusedError
+from gcar_deploy.errors import CancelledError, GcarError, RefusedError, out_of_memory
 from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.orders import Received
 
@@ -194,13 +195,18 @@ class JobQueue:
         except GcarError as error:
             job.error, job.exit_code = str(error), error.exit_code
             state = REFUSED if isinstance(error, RefusedError) else FAILED
-        except MemoryError:
-            job.error, job.exit_code = "out of memory; use a smaller volume or pictures", 1
         except Exception as error:  # noqa: BLE001 - one broken job must not end the worker
-            # Details may name files: they are told only to whoever asks for them.
-            _log.error("internal error: %s", type(error).__name__)
-            _log.debug("internal error", exc_info=True)
-            job.error, job.exit_code = f"internal error: {type(error).__name__}", 1
+            if out_of_memory(error):
+                job.error = "out of memory; use a smaller volume or pictures"
+            else:
+                # Details may name files: they are told only to whoever asks for them.
+                _log.error("internal error: %s", type(error).__name__)
+                _log.debug("internal error", exc_info=True)
+                job.error = f"internal error: {type(error).__name__}"
+            job.exit_code = 1
+        if state != DONE:
+            # What a broken job held hangs in cycles of frames and errors; the next job needs it.
+            gc.collect()
         job.seconds = time.perf_counter() - started
         # Last, since whoever sees the state may read the rest.
         job.state = state
