@@ -170,8 +170,23 @@ def _reconstructed(
         losses=refined.losses, predictor=centers.points.source, refiner=refined.refiner,
         model=None if predictor is None else predictor.model.label,
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
-        notes=(), options=options, ending=refined.ending, close_calls=refined.close_calls,
+        notes=_marks(options, len(missed)), options=options, ending=refined.ending,
+        close_calls=refined.close_calls,
     )  # fmt: skip
+
+
+def _marks(options: RunOptions, missed: int) -> tuple[str, ...]:
+    """Say what of the result goes back to marks of the user; of deletions ``missed`` did nothing.
+
+    Lesions are said by who measures them.
+    """
+    counts = {
+        "branches deleted": len(options.deleted_mm) - missed,
+        "landmarks that hold the views to each other": len(options.landmarks),
+        "marks of one vessel in several views": len(options.same_branch),
+        "inlets of an artery": len(options.ostia),
+    }
+    return tuple(f"of the user: {what} ({n})" for what, n in counts.items() if n)
 
 
 def _nothing(step: Step) -> None:

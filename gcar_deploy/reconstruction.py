@@ -175,7 +175,7 @@ class Reconstruction:
         judged = tuple(self.quality.views[p] for p in places)
         said = (p.note(a.view_id) for p, a in zip(poses, angiograms, strict=True))
         means = self.gaussians.means_mm + frame.origin_mm
-        return dataclasses.replace(
+        given = dataclasses.replace(
             self,
             quality=dataclasses.replace(self.quality, views=judged),
             tree=self.tree.moved(frame.origin_mm),
@@ -187,6 +187,9 @@ class Reconstruction:
                 for call in self.close_calls
             ),
         )  # fmt: skip
+        if not options.lesions:
+            return given
+        return dataclasses.replace(given, notes=(*given.notes, *given.measured.unplaced))
 
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""
@@ -206,7 +209,7 @@ class Reconstruction:
             "status": self.quality.status,
             "sentence": self.quality.sentence,
             "findings": list(self.quality.findings),
-            "notes": [*self.notes, *self.measured.unplaced],
+            "notes": list(self.notes),
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],

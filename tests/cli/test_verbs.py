@@ -305,6 +305,26 @@ def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_disk_behind_stdout_is_one_line_and_the_result_stays(good_case, tmp_path):
+    command = [sys.executable, "-m", "gcar_deploy.cli.main"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*command, *map(str, run_arguments(good_case, tmp_path / "out"))],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == "gcar: error: cannot write: No space left on device"
+    assert (tmp_path / "out" / "result.json").is_file()
+
+
+def test_a_lesion_where_no_branch_runs_is_said(good_case, tmp_path):
+    done = gcar(*run_arguments(good_case, tmp_path / "out", "--lesion", "1:1,1:3,3"))
+    assert done.code == 0 and "lesion 1: no branch passes within 3 mm" in done.err
+    notes = json.loads((tmp_path / "out" / "result.json").read_text())["notes"]
+    assert sum("lesion 1" in note for note in notes) == 1
+
+
 @pytest.mark.parametrize(
     ("raised", "word", "code"),
     [(entry.Terminated, "terminated", 143), (KeyboardInterrupt, "interrupted", 130)],

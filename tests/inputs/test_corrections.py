@@ -66,8 +66,9 @@ def test_a_deleted_branch_is_gone_and_the_rest_stays(engine, order, plain):
     assert found.tree.length_mm == pytest.approx(plain.tree.length_mm - gone.length_mm, abs=1e-6)
     gap = np.linalg.norm(found.tree.points() - np.array(place), axis=1).min()
     assert gap > 3 and found.volume.sum() < plain.volume.sum() - 20
-    assert any("deleted_mm 2: no branch passes" in text for text in found.quality.findings)
-    assert not any("deleted_mm 1" in text for text in found.quality.findings)
+    assert any("deleted branch 2: none passes" in text for text in found.quality.findings)
+    assert not any("deleted branch 1" in text for text in found.quality.findings)
+    assert found.notes == (*plain.notes, "of the user: branches deleted (1)")
 
 
 @pytest.mark.slow
@@ -89,6 +90,7 @@ def test_a_marked_ostium_is_where_the_tree_begins(engine, order, plain):
     marks = tuple(tuple(view.carm.project(tip[None])[0][0].tolist()) for view in plain.views)
     found = again(engine, order, ostia=(marks,))
     assert np.linalg.norm(found.tree.branches[0].points_mm[0] - tip) < 1.0
+    assert found.notes == (*plain.notes, "of the user: inlets of an artery (1)")
     assert np.linalg.norm(plain.tree.branches[0].points_mm[0] - tip) > 20.0
 
 
