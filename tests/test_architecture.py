@@ -16,7 +16,7 @@ PACKAGES = {"gcar_deploy": ROOT / "gcar_deploy", "gcar_export": ROOT / "export"}
 PACKAGE = PACKAGES["gcar_deploy"]
 #: from the ground up: a room imports those of lower floors alone; rooms on one floor keep apart
 RUNTIME_FLOORS = (
-    "errors types files plain",
+    "errors types files plain scratch",
     "config stopwatch beside",
     "geometry",
     "models",

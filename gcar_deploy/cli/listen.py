@@ -96,12 +96,14 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
         from gcar_deploy.worker.send import parse_peer, sent_back
     from gcar_deploy.worker.jobs import Job, JobQueue
     from gcar_deploy.worker.orders import do_order
+    from gcar_deploy.worker.scratch import sweep_scratch
 
     peer = None if service.send_to is None else parse_peer(service.send_to)
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{out_dir} cannot be made ({error.strerror})") from None
+    sweep_scratch()
     warm = engine.engine(order)
     warm.warmup()
     over = threading.Event()

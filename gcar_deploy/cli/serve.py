@@ -115,10 +115,12 @@ def serve(door: Door, limits: Limits, order: Order, engine: EngineChoice, talk: 
     from gcar_deploy.worker.folder import AllowedFolder
     from gcar_deploy.worker.jobs import JobQueue
     from gcar_deploy.worker.orders import do_order
+    from gcar_deploy.worker.scratch import sweep_scratch
 
     allowed = None if door.folder is None else AllowedFolder(door.folder)
     # Only what will serve changes its process: a refused call leaves it as it was.
     limit_memory(limits.memory_mib)
+    sweep_scratch()
     # SIGTERM, like Ctrl-C, ends a server in good order.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     warm = engine.engine(order)

@@ -16,7 +16,7 @@ from typing import Any
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.files import read_bounded
-from gcar_deploy.output.scratch import FRESH, OLD, scratch_folder, sweep
+from gcar_deploy.scratch import FRESH, OLD, scratch_folder, sweep
 
 _AT_FDCWD = -100
 _RENAME_NOREPLACE = 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import threading
 from http import HTTPStatus
 from importlib import resources
@@ -22,7 +21,8 @@ from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
 from gcar_deploy.worker.loopback import THREADS, error, guard, tell_errors
-from gcar_deploy.worker.orders import Received, new_scratch, placed, receive, scratch_file
+from gcar_deploy.worker.orders import Received, placed, receive, scratch_file
+from gcar_deploy.worker.scratch import drop_scratch, new_scratch
 
 #: answered without a token: nothing in them is anybody's
 _OPEN = ("/health", "/openapi.json")
@@ -202,7 +202,7 @@ def _uploaded(folder: AllowedFolder | None) -> Received:
     try:
         return Received(order.with_files(saved), scratch)
     except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
+        drop_scratch(scratch)
         raise
 
 

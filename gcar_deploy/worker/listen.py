@@ -10,7 +10,6 @@ import dataclasses
 import json
 import logging
 import re
-import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,8 @@ from gcar_deploy.dicom.header import CLASSIC, ENHANCED, SYNTAXES
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.inputs.order import MOST_VIEWS, Order
 from gcar_deploy.worker.jobs import Job, JobQueue
-from gcar_deploy.worker.orders import Received, new_scratch
+from gcar_deploy.worker.orders import Received
+from gcar_deploy.worker.scratch import drop_scratch, new_scratch
 
 _log = logging.getLogger(__name__)
 LOOPBACK = "127.0.0.1"
@@ -113,7 +113,7 @@ class Listener:
         with self._lock:
             studies, self._studies = self._studies, {}
         for study in studies.values():
-            shutil.rmtree(study.scratch, ignore_errors=True)
+            drop_scratch(study.scratch)
 
     def _store(self, event: Any) -> int:
         """Keep one run as it came, not a bit of it changed."""
@@ -131,7 +131,9 @@ class Listener:
         with self._lock:
             if study not in self._studies and len(self._studies) >= MOST_STUDIES:
                 return OUT_OF_RESOURCES
-            found = self._studies.setdefault(study, Study(new_scratch()))
+            if study not in self._studies:
+                self._studies[study] = Study(new_scratch())
+            found = self._studies[study]
             if instance not in found.runs and len(found.runs) >= MOST_VIEWS:
                 return OUT_OF_RESOURCES
             path = found.runs.setdefault(instance, found.scratch / f"run{len(found.runs) + 1}.dcm")

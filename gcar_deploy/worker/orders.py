@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 from gcar_deploy.engine import Engine, check_target_of, deliver
 from gcar_deploy.inputs.order import Order, parse_order
 from gcar_deploy.worker.folder import AllowedFolder
+from gcar_deploy.worker.scratch import drop_scratch, new_scratch
 
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,8}")
 
@@ -33,7 +32,7 @@ class Received:
     def clean(self) -> None:
         """Remove the private folder."""
         if self.scratch is not None:
-            shutil.rmtree(self.scratch, ignore_errors=True)
+            drop_scratch(self.scratch)
 
 
 def receive(values: Any, folder: AllowedFolder | None) -> Received:
@@ -59,7 +58,7 @@ def receive(values: Any, folder: AllowedFolder | None) -> Received:
             lambda name, path: folder.copy(str(path), scratch_file(scratch, name, str(path)))
         )
     except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
+        drop_scratch(scratch)
         raise
     return Received(own, scratch)
 
@@ -79,11 +78,6 @@ def suffix_of(name: str) -> str:
     """Suffix of a file name, from which its format is told; empty if it is an odd one."""
     suffix = Path(name).suffix
     return suffix.lower() if _SUFFIX.fullmatch(suffix) else ""
-
-
-def new_scratch() -> Path:
-    """Make a folder that only this user may read."""
-    return Path(tempfile.mkdtemp(prefix="gcar-worker-"))
 
 
 def do_order(

@@ -178,17 +178,17 @@ MUTANTS = (
     ),
     Mutant(
         "atomicity: the unfinished folder stays after an error",
-        "gcar_deploy/output/scratch.py",
-        "        shutil.rmtree(scratch, ignore_errors=True)\n        if handle",
-        "        if handle",
+        "gcar_deploy/scratch.py",
+        "    shutil.rmtree(scratch, ignore_errors=True)\n    if handle",
+        "    if handle",
         (_FOLDER,),
     ),
     Mutant(
         "atomicity: folders of living owners are swept",
-        "gcar_deploy/output/scratch.py",
+        "gcar_deploy/scratch.py",
         "fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)",
         "pass",
-        ("tests/output/test_scratch.py",),
+        ("tests/test_scratch.py",),
     ),
     Mutant(
         "output: volume without the turn from LPS to RAS",

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import gc
+import os
+import subprocess
+import sys
+import tempfile
 import weakref
 from pathlib import Path
 
@@ -13,7 +17,8 @@ import pytest
 from gcar_deploy.errors import NumericalError
 from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.jobs import JobQueue, QueueFullError
-from gcar_deploy.worker.orders import Received, new_scratch, suffix_of
+from gcar_deploy.worker.orders import Received, suffix_of
+from gcar_deploy.worker.scratch import drop_scratch, new_scratch, sweep_scratch
 
 
 def an_order(scratch=None, **fields):
@@ -99,6 +104,30 @@ def test_old_jobs_are_forgotten_with_their_files(queue):
     assert not any(job.received.scratch.exists() for job in jobs)
     with pytest.raises(QueueFullError):
         queue.submit(an_order())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX locks")
+def test_pictures_of_a_killed_worker_are_removed_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code = (
+        "import time; from gcar_deploy.worker.scratch import new_scratch\n"
+        "folder = new_scratch(); (folder / 'view1.png').write_bytes(b'1')\n"
+        "print(folder, flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    ) as worker:  # fmt: skip
+        folder = Path(worker.stdout.readline().strip())
+        own = new_scratch()
+        try:
+            assert sweep_scratch() == 0 and (folder / "view1.png").exists()
+        finally:
+            worker.kill()
+    assert folder.parent == tmp_path and sweep_scratch() == 1
+    assert list(tmp_path.iterdir()) == [own]
+    drop_scratch(own)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_suffixes_of_uploaded_names():

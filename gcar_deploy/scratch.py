@@ -1,4 +1,4 @@
-"""Private folders beside a result, and the sweeping of those whose owner was killed.
+"""Private folders for what is not finished, and the sweeping of those whose owner was killed.
 
 The owner holds a lock on its folder as long as it lives; the system takes the lock away with
 the process, however it ends. So a folder that can be locked is nobody's any more.
@@ -25,26 +25,31 @@ else:
     fcntl = _fcntl
 
 _log = logging.getLogger(__name__)
-_PREFIX = ".gcar-save-"
-_NAME = re.compile(re.escape(_PREFIX) + r"[a-z0-9_]{8}")
-#: what a scratch folder may hold: the folder being written, and the one that it replaces
+#: of a folder beside a result, and of one that holds the files of a worker's order
+SAVE, WORKER = ".gcar-save-", "gcar-worker-"
+#: what a folder beside a result may hold: the folder being written, and the one that it replaces
 FRESH, OLD = "new", "old"
 
 
 @contextlib.contextmanager
 def scratch_folder(parent: Path) -> Iterator[Path]:
-    """Make a temporary folder in ``parent``; it is removed at the end, also on an interrupt."""
-    scratch, handle = _locked(parent)
+    """Make a folder beside a result; it is removed at the end, also on an interrupt."""
+    scratch, handle = held_folder(parent, SAVE)
     try:
         yield scratch
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-        if handle is not None:
-            os.close(handle)
+        drop(scratch, handle)
 
 
-def sweep(parent: Path) -> int:
-    """Remove scratch folders in ``parent`` whose owner is dead; return how many.
+def drop(scratch: Path, handle: int | None) -> None:
+    """Remove a folder that is held, and let it go."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    if handle is not None:
+        os.close(handle)
+
+
+def sweep(parent: Path, prefix: str = SAVE) -> int:
+    """Remove folders in ``parent`` whose owner is dead; return how many.
 
     A folder that holds both the new and the replaced result is kept: its owner died between
     two renames, and it is the only place where they are.
@@ -54,17 +59,22 @@ def sweep(parent: Path) -> int:
     swept = 0
     with contextlib.suppress(OSError):
         for path in list(parent.iterdir()):
-            if _NAME.fullmatch(path.name) and _sweep_one(path):
+            if re.fullmatch(re.escape(prefix) + "[a-z0-9_]{8}", path.name) and _sweep_one(path):
                 swept += 1
     if swept:
         _log.info("removed %d unfinished folders of runs that were killed", swept)
     return swept
 
 
-def _locked(parent: Path) -> tuple[Path, int | None]:
-    """Make a folder and lock it; a sweeper that comes in between makes another try needed."""
+def held_folder(parent: Path, prefix: str) -> tuple[Path, int | None]:
+    """Make a folder that only this user may read, and lock it.
+
+    Returns
+    -------
+    the folder, and what holds the lock until it is closed (None where there are no locks)
+    """
     while True:
-        scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
+        scratch = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
         if fcntl is None:
             return scratch, None
         handle = os.open(scratch, os.O_RDONLY)
@@ -72,6 +82,7 @@ def _locked(parent: Path) -> tuple[Path, int | None]:
             fcntl.flock(handle, fcntl.LOCK_EX)
             if _same(handle, scratch):
                 return scratch, handle
+            # A sweeper came in between.
         except OSError:  # a file system without locks: no one can sweep there either
             os.close(handle)
             return scratch, None

@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from gcar_deploy.output.folder import write_folder
-from gcar_deploy.output.scratch import scratch_folder, sweep
+from gcar_deploy.scratch import scratch_folder, sweep
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX locks")
 
 OWNER = """
 import sys, time
 from pathlib import Path
-from gcar_deploy.output.scratch import scratch_folder
+from gcar_deploy.scratch import scratch_folder
 with scratch_folder(Path(sys.argv[1])) as folder:
     (folder / "new").mkdir()
     (folder / "new" / "half").write_bytes(b"1")
