@@ -12,7 +12,7 @@ from typing import Any
 
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine, check_target_of, deliver
-from gcar_deploy.errors import UsageError
+from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.inputs.order import Order, load_order
 from gcar_deploy.workbench.case import ORDER_NAME, RESULT_NAME, Case
 
@@ -114,9 +114,14 @@ class Desk:
         """Do the order of a case and remember its result; see ``worker.jobs.Work``."""
         case = next(c for c in self._cases.values() if c.folder == _parent(order))
         check_target_of(order)
-        result = engine.reconstruct_order(
-            order, on_progress=on_progress, cancel=cancel, on_step=case.take_step
-        )
+        try:
+            result = engine.reconstruct_order(
+                order, on_progress=on_progress, cancel=cancel, on_step=case.take_step
+            )
+        except RefusedError:
+            # What an earlier order gave is not what this one gives; its files stay.
+            case.result = None
+            raise
         folder = deliver(result, order)
         case.result = result
         return result.summary(), folder

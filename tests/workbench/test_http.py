@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 
 import pytest
 
@@ -64,6 +65,26 @@ def test_pages_of_others_and_foreign_names_are_turned_away(ask):
     own = ask("GET", "/api/desk", headers={**BEARER, "Origin": "http://127.0.0.1"})
     assert own.status_code == 200
     assert ask("GET", "/api/desk", base_url="http://evil.example").status_code in (400, 421)
+
+
+@pytest.mark.slow
+def test_a_refused_run_leaves_no_result_of_an_earlier_order(ask, desk):
+    case = desk.demo()
+
+    def ran():
+        job = ask("POST", f"/api/cases/{case.id}/run").json["id"]
+        while (told := ask("GET", f"/api/jobs/{job}").json)["state"] in ("queued", "running"):
+            time.sleep(0.1)
+        return told["state"]
+
+    assert ran() == "done" and case.described()["result"] is True
+    made = (case.folder / "result" / "result.json").read_bytes()
+    everything = [[-9, -9], [999, -9], [999, 999], [-9, 999]]
+    edits = {"1": [{"do": "erase", "points": everything}]}
+    assert ask("PUT", f"/api/cases/{case.id}/order", json={"edits": edits}).status_code == 200
+    assert ran() == "refused" and case.described()["result"] is False
+    assert ask("GET", f"/api/cases/{case.id}/result").status_code == 400
+    assert (case.folder / "result" / "result.json").read_bytes() == made
 
 
 def test_result_files_have_an_address_of_their_own(ask, desk):
