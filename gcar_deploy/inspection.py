@@ -25,8 +25,8 @@ from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
-from gcar_deploy.predict import Predictor, load_predictor, quick_tree
-from gcar_deploy.quality import check_views
+from gcar_deploy.predict import Predictor, load_predictor, quick_tree, seen_by_all
+from gcar_deploy.quality import check_candidates, check_views
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.tree import Tree
 
@@ -155,6 +155,10 @@ def _registered(
                 pair["shift_mm"] = pose.shift_mm
                 pair["after_shift"] = pose.after
     placed.or_refuse()
+    marked = placed.marks(options)
+    with placed.hinting():
+        hull = seen_by_all(placed.views, grid, marked, predictor()).hull
+        check_candidates(len(hull), hull.lattice, marked.quality)
     return list(placed.findings)
 
 

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from gcar_deploy.cli.main import gcar
 from gcar_deploy.config import PredictOptions, RefineOptions, RunOptions
 from gcar_deploy.engine import Engine
+from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
@@ -73,6 +74,18 @@ def test_says_what_run_would_refuse_with_its_code(case, change, code):
     args = ["validate", *map(str, pictures), "--geom", str(geom)]
     result = runner.invoke(gcar, [*args, "--json"])
     assert '"would": "refuse"' in result.output
+
+
+def test_a_volume_beside_the_tree_is_refused_in_the_words_of_run(case):
+    pictures, geom = files(case)
+    told = json.loads(geom.read_text())
+    told["volume"]["center_mm"] = [60.0, 60.0, 60.0]
+    geom.write_text(json.dumps(told))
+    found = inspect_files(pictures, geom)
+    with pytest.raises(RefusedError) as refused:
+        Engine(threads=1).reconstruct(pictures, geom)
+    assert "are seen as vessel by all" in str(refused.value)
+    assert found.to_dict()["reason"] == str(refused.value)
 
 
 def test_command_prints_clinical_words(case):
