@@ -113,6 +113,8 @@ def _of_folder(path: Path, options: RunOptions) -> Cine:
         raise ImageError(f"{path.name}: cannot be read ({error.strerror})") from None
     pictures = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=_natural)
     limits = options.dicom.limits
+    if not pictures and any(map(is_dicom, files)):
+        raise ImageError(f"{path.name}: the folder holds DICOM files; name the run's file itself")
     if not pictures:
         raise ImageError(f"{path.name}: the folder holds no picture (.png, .tif, .npy)")
     if len(pictures) > limits.max_frames:

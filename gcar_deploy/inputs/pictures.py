@@ -63,8 +63,7 @@ def prepare(
     ImageError
         A picture or mask cannot be read.
     """
-    if len(views) < 2:
-        raise UsageError(f"{len(views)} picture given; two or more are needed")
+    _check_kinds(views)
     if geometry is None:
         angiograms, grid, notes = _from_headers(views, options)
     elif isinstance(geometry, Grid):
@@ -82,6 +81,20 @@ def prepare(
         angiograms[_index(k, "edits", angiograms)] = with_drawn(angiograms[k - 1], lines)
         notes += [f"view {k}: {text}" for text in _said(lines)]
     return angiograms, grid, notes
+
+
+def _check_kinds(views: Sequence[Picture]) -> None:
+    """Say at once what is no list of pictures: a string is a sequence as well."""
+    if isinstance(views, (str, bytes)) or not isinstance(views, (Sequence, np.ndarray)):
+        raise UsageError(f"views is a {type(views).__name__}; give a list of two or more pictures")
+    if len(views) < 2:
+        raise UsageError(f"{len(views)} picture given; two or more are needed")
+    for number, view in enumerate(views, start=1):
+        if not isinstance(view, (str, Path, np.ndarray, Angiogram)):
+            raise UsageError(
+                f"view {number} is a {type(view).__name__}; give a path, an array of counts or an "
+                "Angiogram"
+            )
 
 
 def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
@@ -207,6 +220,11 @@ def _from_headers(
     """Pictures whose own headers tell the geometry: DICOM XA alone."""
     paths = [view for view in views if isinstance(view, (str, Path))]
     for path in paths:
+        if Path(path).is_dir():
+            raise UsageError(
+                f"{Path(path).name} is a folder: name the DICOM file of the run in it, or tell the "
+                "geometry of its pictures (--geom geom.json)"
+            )
         if not is_dicom(path):
             raise UsageError(
                 f"{Path(path).name} is no DICOM file: its geometry is needed (--geom geom.json)"
@@ -267,6 +285,8 @@ def _scene(geometry: Geometry) -> Scene:
             return parse_scene(json.dumps(dict(geometry)), "geometry")
         except (TypeError, ValueError) as error:
             raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
+    if isinstance(geometry, str) and geometry.lstrip().startswith("{"):
+        raise UsageError("geometry is JSON text; give a path, or json.loads of it")
     if isinstance(geometry, (str, Path)):
         return load_scene(geometry)
     raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")

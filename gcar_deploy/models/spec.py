@@ -107,9 +107,8 @@ def read_model(path: Path, kinds: Sequence[Kind], limits: ModelLimits | None = N
         inputs, or holds what a model of this project does not need (see ``guard``).
     """
     limits = limits or ModelLimits()
-    spec_path = path.with_suffix(".json")
     data = _read("model file", path, limits.max_bytes)
-    spec = _spec(spec_path)
+    spec = _spec(path.with_suffix(".json"))
     digest = hashlib.sha256(data).hexdigest()
     if digest != spec.get("sha256"):
         raise ModelError(
@@ -180,7 +179,7 @@ def _read(what: str, path: Path, max_bytes: int) -> bytes:
     try:
         return read_bounded(path, max_bytes)
     except ValueError as error:
-        raise ModelError(f"{what} {path.name}: {error}") from None
+        raise ModelError(f"{what} {path.name or path}: {error}") from None
 
 
 def _spec(path: Path) -> dict[str, Any]:

@@ -192,3 +192,8 @@ def test_a_pinned_model_that_does_not_open_says_so_when_it_is_run():
         opening.run({}, [(1, 5)])
     with pytest.raises(ModelError, match="model tiny does not load"):
         Session(dataclasses.replace(broken, pinned=False, golden=None), input_names())
+
+
+def test_a_folder_for_a_model_is_one_sentence():
+    with pytest.raises(ModelError, match=r"model file \.: is not a regular file"):
+        read_predictor(Path("."))

@@ -1,0 +1,66 @@
+"""What a caller in Python may get wrong is one sentence of the project, whatever its type."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from gcar_deploy.config import RunOptions
+from gcar_deploy.errors import GcarError, ImageError, UsageError
+from gcar_deploy.inputs.pictures import prepare
+from tests.cli.conftest import geometry, good_case  # noqa: F401 - a fixture
+
+
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [
+        ("view1.png", "views is a str; give a list of two or more pictures"),
+        (b"view1.png", "views is a bytes; give a list"),
+        ({"a": 1, "b": 2}, "views is a dict; give a list"),
+        (None, "views is a NoneType; give a list"),
+        ([], "0 picture given"),
+        (["view1.png"], "1 picture given"),
+        (["view1.png", 3], "view 2 is a int; give a path, an array"),
+        ([None, None], "view 1 is a NoneType"),
+        ([[[1, 2], [3, 4]], np.zeros((96, 96))], "view 1 is a list"),
+    ],
+)
+def test_views_of_a_wrong_type(views, words):
+    with pytest.raises(UsageError) as refused:
+        prepare(views, geometry(), RunOptions())
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [(json.dumps({"a": 1}), "geometry is JSON text"), (7, "geometry is a int; give a path")],
+)
+def test_geometry_of_a_wrong_type(told, words):
+    with pytest.raises(UsageError, match=words):
+        prepare([np.zeros((96, 96), np.uint8)] * 2, told, RunOptions())
+
+
+def test_an_array_of_two_pictures_is_two_pictures(good_case):  # noqa: F811
+    files = [good_case / "view1.png", good_case / "view2.png"]
+    read = [one.pixels for one in prepare(files, geometry(), RunOptions())[0]]
+    again = prepare(np.stack(read), geometry(), RunOptions())[0]
+    for one, other in zip(again, read, strict=True):
+        np.testing.assert_array_equal(one.pixels, other)
+
+
+def test_folders_of_dicom_files_say_what_to_name(tmp_path):
+    """The 128 bytes and four letters that every DICOM file begins with."""
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "IM1").write_bytes(bytes(128) + b"DICM")
+    folders = [tmp_path / name for name in "ab"]
+    with pytest.raises(UsageError, match="a is a folder: name the DICOM file of the run in it"):
+        prepare(folders, None, RunOptions())
+    with pytest.raises(ImageError, match="the folder holds DICOM files; name the run's file"):
+        prepare(folders, geometry(), RunOptions())
+    shutil.rmtree(folders[0])
+    with pytest.raises(GcarError):
+        prepare(folders, geometry(), RunOptions())
