@@ -21,6 +21,12 @@ from gcar_export.cli.wrong_scenes import wrong_scenes
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_REPLACE = click.option("--force", is_flag=True, help="Replace a model that is there.")
+
+
+def _check_free(out: Path, force: bool) -> None:
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists; add --force to replace it")
 
 
 class _Group(click.Group):
@@ -30,20 +36,22 @@ class _Group(click.Group):
         try:
             return super().invoke(ctx)
         except GcarError as error:
-            click.echo(f"error: {error}", err=True)
+            click.echo(f"gcar-export: error: {error}", err=True)
             sys.exit(error.exit_code)
         except KeyboardInterrupt:
-            click.echo("interrupted", err=True)
+            click.echo("gcar-export: interrupted", err=True)
             sys.exit(130)
         except (click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except ImportError as error:
-            click.echo(f"error: {error.name} is missing; pip install 'gcar[export]'", err=True)
+            need = f"{error.name} is missing; pip install 'gcar[export]'"
+            click.echo(f"gcar-export: error: {need}", err=True)
             sys.exit(1)
         except Exception as error:
             logging.getLogger("gcar_export").info("internal error", exc_info=True)
             detail = (str(error).splitlines() or [""])[0][:200]
-            click.echo(f"error: internal: {type(error).__name__} {detail}; see -v", err=True)
+            kind = type(error).__name__
+            click.echo(f"gcar-export: error: internal: {kind} {detail}; see -v", err=True)
             sys.exit(1)
 
 
@@ -180,13 +188,15 @@ def train(
     "--inputs", type=click.IntRange(1), default=60, show_default=True, help="For the parity check."
 )
 @click.option("--int8", is_flag=True, help="Also try OUT-int8.onnx, kept if the task allows it.")
-def export(checkpoint: Path, out: Path, inputs: int, int8: bool) -> None:
+@_REPLACE
+def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) -> None:
     """Turn CHECKPOINT (.safetensors) into one ONNX file with its spec, and prove it.
 
     Example: gcar-export export runs/a/checkpoint.safetensors --out models/gcp-multi.onnx
     """
     from gcar_export.shipping.parity import export_checked
 
+    _check_free(out, force)
     found = export_checked(checkpoint, out, inputs)
     click.echo(
         f"{out}: {found.inputs} inputs, largest difference {found.worst:.1e} of the range, "
@@ -394,7 +404,8 @@ def train_segmenter(
 @click.argument("checkpoint", type=_FILE)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
 @click.option("--devices", type=_FILE, help="Of train-devices, or a model that has one: goes in.")
-def export_segmenter(checkpoint: Path, out: Path, devices: Path | None) -> None:
+@_REPLACE
+def export_segmenter(checkpoint: Path, out: Path, devices: Path | None, force: bool) -> None:
     """Turn the segmentation network's CHECKPOINT into one ONNX file with its spec, and prove it.
 
     CHECKPOINT may be an ONNX model, whose segmenter is taken as it is.
@@ -403,5 +414,6 @@ def export_segmenter(checkpoint: Path, out: Path, devices: Path | None) -> None:
     """
     from gcar_export.shipping import export_segmenter as exporting
 
+    _check_free(out, force)
     worst = exporting.export_segmenter(checkpoint, out, devices=devices)
     click.echo(f"{out}: largest difference of a probability {worst:.1e}")

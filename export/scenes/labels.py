@@ -33,6 +33,9 @@ MARGIN_VOXELS = 2
 CROP_BELOW = 0.5
 #: label trees whose box centre is this close to the isocentre are left where they are.
 CENTRED_WITHIN_MM = 2.0
+#: a part with a smaller share of the largest one's volume is a crumb and no tree of its own; the
+#: smallest right artery met has 0.09
+LEAST_TREE = 0.03
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,11 +119,18 @@ class LabelVolume:
         Raises
         ------
         UsageError
-            If there are fewer than two parts.
+            If there are fewer than two parts, or the second has less than ``LEAST_TREE`` of the
+            volume of the first.
         """
         parts = self.components()
         if len(parts) < 2:
             raise UsageError(f"{self.name}: one connected part only, no left and right tree")
+        first, second = (float(part.occupancy.sum()) for part in parts[:2])
+        if second < LEAST_TREE * first:
+            raise UsageError(
+                f"{self.name}: the second part has {second / first:.1%} of the first one's volume: "
+                "a crumb, no tree"
+            )
         x = [ndimage.center_of_mass(part.occupancy)[0] for part in parts[:2]]
         left, right = (parts[0], parts[1]) if x[0] > x[1] else (parts[1], parts[0])
         return left, right

@@ -103,5 +103,5 @@ def test_the_command_says_it_in_one_line_and_leaves_nothing(checkpoint, tmp_path
     out = tmp_path / "out" / "m.onnx"
     done = CliRunner().invoke(main, ["export", str(checkpoint), "--out", str(out)])
     assert done.exit_code == 5 and "Traceback" not in done.output
-    assert done.output.startswith("error: checkpoint") and done.output.count("\n") == 1
+    assert done.output.startswith("gcar-export: error: checkpoint") and done.output.count("\n") == 1
     assert not out.parent.exists()

@@ -5,10 +5,12 @@ import json
 
 import pytest
 import torch
+from click.testing import CliRunner
 from safetensors.torch import load_file, save_file
 
 from gcar_deploy.errors import ModelError
 from gcar_deploy.predict.kinds import read_predictor
+from gcar_export.cli.main import main
 from gcar_export.shipping import parity as parity_module
 from gcar_export.shipping.export_onnx import load_checkpoint
 from gcar_export.shipping.parity import Parity, accept, export_checked, parity
@@ -43,6 +45,18 @@ def test_a_checkpoint_of_another_size_goes_through(exported):
     assert {f.name for f in model.parent.iterdir()} == {
         "checkpoint.safetensors", "manifest.json", "m.onnx", "m.json", "m.golden.npz",
     }  # fmt: skip
+
+
+def test_a_model_is_replaced_only_when_asked(exported):
+    checkpoint, model, _ = exported
+    before = model.read_bytes()
+    done = CliRunner().invoke(main, ["export", str(checkpoint), "--out", str(model)])
+    assert done.exit_code == 2 and done.output == (
+        f"gcar-export: error: {model} exists; add --force to replace it\n"
+    )
+    assert model.read_bytes() == before
+    arguments = ["export", str(checkpoint), "--out", str(model), "--force", "--inputs", "1"]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
 
 
 def test_card_of_the_file_is_that_of_the_spec(exported):

@@ -141,6 +141,10 @@ def test_left_tree_is_the_one_to_the_patients_left():
     assert np.allclose(low + high, 0)
     with pytest.raises(UsageError):
         left.left_right()
+    crumb = left.occupancy.copy()
+    crumb[-2:, -2:, -2:] = 1
+    with pytest.raises(UsageError, match=r"1\.7% of the first one's volume: a crumb"):
+        LabelVolume(occupancy=crumb, grid=left.grid).left_right()
 
 
 def test_occupancy_on_a_grid_keeps_mass_and_the_identity():
