@@ -131,7 +131,7 @@ def test_replayed_gates_are_those_of_the_engine(subjects, kind, pictures):
         assert kind == "swapped" or "swapped?" not in str(error)
         assert "swapped?" in str(error) or kind != "swapped" or pictures != "path length"
     else:
-        assert replayed(found, GATES) == result.status
+        assert replayed(found, GATES) == result.status, (found.whole, result.to_json())
         assert kind == "same" or result.status == "degraded"
         assert kind == "swapped" or "swapped?" not in " ".join(result.quality.findings)
 
