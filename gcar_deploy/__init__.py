@@ -15,15 +15,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gcar_deploy.config import RunOptions
     from gcar_deploy.engine import Engine
-    from gcar_deploy.errors import GcarError
+    from gcar_deploy.errors import CancelledError, GcarError
     from gcar_deploy.geometry.carm import CArm
     from gcar_deploy.geometry.grid import Grid
     from gcar_deploy.geometry.scene import Scene, load_scene
+    from gcar_deploy.imaging.angiogram import Angiogram
     from gcar_deploy.inputs.order import Order, load_order
     from gcar_deploy.result import Result
 
 __all__ = [
+    "Angiogram",
     "CArm",
+    "CancelledError",
     "Engine",
     "GcarError",
     "Grid",
@@ -36,7 +39,9 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Angiogram": "gcar_deploy.imaging.angiogram",
     "CArm": "gcar_deploy.geometry.carm",
+    "CancelledError": "gcar_deploy.errors",
     "Engine": "gcar_deploy.engine",
     "GcarError": "gcar_deploy.errors",
     "Grid": "gcar_deploy.geometry.grid",

@@ -81,7 +81,7 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
 
 def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
     """Put on the desk what the command names; return the case's name, or the key of a result."""
-    from gcar_deploy.errors import UsageError
+    from gcar_deploy.errors import ImageError, UsageError
     from gcar_deploy.workbench.desk import absolute
 
     views = order.views
@@ -95,4 +95,8 @@ def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
                 raise
             return None, str(desk.shelve(views[0]))
     check_views(order)
+    for path in order.files.values():
+        # The page would open, and show that nothing is there.
+        if not path.exists():
+            raise ImageError(f"{path}: no such file; check the path")
     return str(desk.add(desk.new_folder("case"), absolute(order)).id), None

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gcar_deploy.config import ImagingOptions, PictureLimits, RunOptions
+from gcar_deploy.config import DicomOptions, ImagingOptions, PictureLimits, RunOptions
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
@@ -167,9 +167,9 @@ def _by_scene(
         raise GeometryError(
             f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
         )
-    notes = list(scene.warnings)
     angiograms = []
     runs = find_runs(views, options)
+    notes = [*scene.warnings, *_unused(options.dicom, any_run=bool(runs.wanted))]
     seen = seen_runs(runs, scene, options)
     chosen = together(runs, seen)
     for number, (picture, view) in enumerate(zip(views, scene.views, strict=True), start=1):
@@ -190,6 +190,17 @@ def _by_scene(
             angiograms.append(_angiogram(picture, view, options.imaging, notes))
     angiograms, more = with_bare(angiograms, runs, seen)
     return angiograms, scene.volume_grid(), notes + more
+
+
+def _unused(options: DicomOptions, *, any_run: bool) -> list[str]:
+    """Say which options have nothing to act on, where a scene tells the geometry."""
+    said = []
+    if options.frames != DicomOptions().frames and not any_run:
+        said.append("the frame asked for (frames) is not used: no view is a run")
+    for key in ("pixel_spacing_mm", "sod_mm"):
+        if getattr(options, key) is not None:
+            said.append(f"{key} as an option is not used: the geometry has its own")
+    return said
 
 
 def _angiogram(

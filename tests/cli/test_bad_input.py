@@ -297,6 +297,13 @@ def test_calls_that_end_early(name, good_case, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_open_says_at_once_that_a_picture_is_missing(good_case):
+    wrong = good_case / "no.png"
+    done = gcar("open", good_case / "view1.png", wrong, "--geom", good_case / "geom.json")
+    assert (done.code, done.out) == (3, "")
+    assert done.err == f"gcar: error: {wrong}: no such file; check the path\n"
+
+
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
 @pytest.mark.req("REQ-29")
 def test_an_existing_target_is_refused_before_any_work(kind, good_case, tmp_path):

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from gcar_deploy.config import RunOptions
+from gcar_deploy.config import DicomOptions, RunOptions
 from gcar_deploy.errors import GcarError, ImageError, UsageError
 from gcar_deploy.inputs.pictures import prepare
 from tests.cli.conftest import geometry, good_case  # noqa: F401 - a fixture
@@ -49,6 +49,15 @@ def test_an_array_of_two_pictures_is_two_pictures(good_case):  # noqa: F811
     again = prepare(np.stack(read), geometry(), RunOptions())[0]
     for one, other in zip(again, read, strict=True):
         np.testing.assert_array_equal(one.pixels, other)
+
+
+def test_what_has_nothing_to_act_on_is_said(good_case):  # noqa: F811
+    files = [good_case / "view1.png", good_case / "view2.png"]
+    asked = DicomOptions(frames=(3,), pixel_spacing_mm=0.3, sod_mm=700.0)
+    notes = prepare(files, geometry(), RunOptions(dicom=asked))[2]
+    for words in ("(frames) is not used", "pixel_spacing_mm as an option", "sod_mm as an option"):
+        assert sum(words in note for note in notes) == 1
+    assert not any("not used" in note for note in prepare(files, geometry(), RunOptions())[2])
 
 
 def test_folders_of_dicom_files_say_what_to_name(tmp_path):
