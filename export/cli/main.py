@@ -376,6 +376,7 @@ def pose_table(trees: int, out: Path) -> None:
 @click.option("--seed", type=int, help="Of the generated pictures and the crops.")
 @click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
 @click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
+@click.option("--folds", type=int, help="Train as many beside it, each without one such part.")
 @click.option("--real-share", type=float, help="Of the pictures of a step, where there are any.")
 @click.option("--pictures", type=int, help="Generated ones that are drawn; each is used often.")
 @click.option(

@@ -93,7 +93,10 @@ def folds(
     return tuple(pictures[:low]) + tuple(pictures[high:]), tuple(pictures[low:high])
 
 
-def expert_pair(pictures: Sequence[ExpertPicture], seed: int, index: int) -> tuple[Array, Array]:
-    """Return the network's input and truth of a crop, as ``augmented.augmented_pair`` does."""
+def expert_pair(
+    pictures: Sequence[ExpertPicture], seed: int, index: int
+) -> tuple[Array, Array, int]:
+    """Return input and truth of a crop, as ``augmented.augmented_pair``, and of which picture."""
     rng = np.random.default_rng([seed, index, 3])
-    return augmented_pair(rng, pictures[int(rng.integers(len(pictures)))].labelled)
+    number = int(rng.integers(len(pictures)))
+    return *augmented_pair(rng, pictures[number].labelled), number

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -95,40 +96,80 @@ def learn(
 
     The mean of its weights is scored at the end and kept in the checkpoint beside them.
     """
-    optimiser = torch.optim.AdamW(
-        net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
-    )
-    mean = MeanWeights(net, options.mean_steps)
-    step = folder.resume(net, optimiser, mean.net)
+    learn_together([(folder, net, lesson)], options, minutes)
+
+
+def learn_together(
+    pupils: Sequence[tuple[RunFolder, N, Lesson[N, B]]],
+    options: LoopOptions,
+    minutes: float | None = None,
+) -> None:
+    """Train several networks, each in its folder, on the batches of the first one's lesson.
+
+    What a network must not learn from a batch its own loss leaves out. Each ends as it would have
+    alone.
+    """
+    runs = [_Run(folder, net, options, lesson) for folder, net, lesson in pupils]
+    step = min(run.step for run in runs)
     line = ProgressLine(step, options.steps, options.batch, "pictures")
     began = time.monotonic()
-    losses: list[float] = []
-    for batch in lesson.batches(step):
+    for batch in pupils[0][2].batches(step):
         if minutes is not None and time.monotonic() - began > 60 * minutes:
             break
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(options, step)
-        losses.append(_taken(lesson.loss_of(batch), net, optimiser))
+        for run in runs:
+            # An interruption between two checkpoints leaves one network ahead.
+            if run.step == step:
+                run.take(batch)
         step += 1
-        mean.add(net, step)
-        line.show(step, losses)
+        if line.due(step):
+            line.show(step, runs[0].recent())
         if step % options.save_every == 0 and step < options.steps:
-            folder.save(net, optimiser, step, mean=mean.net)
-    scores = lesson.validate(mean.net)
-    folder.save(net, optimiser, step, {"validation": scores}, mean.net)
-    recent = [loss for loss in losses[-_RECENT:] if np.isfinite(loss)]
-    folder.log(step, float(np.mean(recent or [np.nan])), {"all": scores})
+            for run in runs:
+                run.save()
+    for run in runs:
+        run.finish()
 
 
-def _taken(
-    loss: torch.Tensor | None, net: torch.nn.Module, optimiser: torch.optim.Optimizer
-) -> float:
-    """Take a step down the loss, unless its gradient is not finite; return the loss."""
-    if loss is None:
-        return float("nan")
-    optimiser.zero_grad()
-    loss.backward()
-    norm = torch.nn.utils.clip_grad_norm_(net.parameters(), _CLIP)
-    if bool(torch.isfinite(norm)):
-        optimiser.step()
-    return float(loss.detach())
+class _Run(Generic[N, B]):
+    """One network with its optimiser, the mean of its weights, and its folder."""
+
+    def __init__(
+        self, folder: RunFolder, net: N, options: LoopOptions, lesson: Lesson[N, B]
+    ) -> None:
+        self.folder, self.net, self.options, self.lesson = folder, net, options, lesson
+        self.optimiser = torch.optim.AdamW(
+            net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
+        )
+        self.mean = MeanWeights(net, options.mean_steps)
+        self.step = folder.resume(net, self.optimiser, self.mean.net)
+        self._losses: deque[torch.Tensor] = deque(maxlen=_RECENT)
+
+    def take(self, batch: B) -> None:
+        """Take a step down the loss of a batch, unless its gradient is not finite."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.options, self.step)
+        loss = self.lesson.loss_of(batch)
+        if loss is not None:
+            self.optimiser.zero_grad()
+            loss.backward()
+            norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), _CLIP)
+            if bool(torch.isfinite(norm)):
+                self.optimiser.step()
+            self._losses.append(loss.detach())
+        self.step += 1
+        self.mean.add(self.net, self.step)
+
+    def recent(self) -> list[float]:
+        """Losses of the last steps."""
+        return [float(loss) for loss in self._losses]
+
+    def save(self, extra: dict[str, object] | None = None) -> None:
+        """Write the checkpoint."""
+        self.folder.save(self.net, self.optimiser, self.step, extra, self.mean.net)
+
+    def finish(self) -> None:
+        """Score the mean of the weights and write the last checkpoint."""
+        scores = self.lesson.validate(self.mean.net)
+        self.save({"validation": scores})
+        recent = [loss for loss in self.recent() if np.isfinite(loss)]
+        self.folder.log(self.step, float(np.mean(recent or [np.nan])), {"all": scores})

@@ -176,14 +176,19 @@ class ProgressLine:
         self.every = every
         self.began = time.monotonic()
 
+    def due(self, step: int) -> bool:
+        """Whether it is its turn after ``step``."""
+        return step % self.every == 0 or step == self.steps
+
     def show(self, step: int, losses: Sequence[float]) -> None:
         """Print after ``step`` if it is its turn."""
-        if step % self.every and step != self.steps:
+        if not self.due(step):
             return
         rate = (step - self.first) / max(time.monotonic() - self.began, 1e-9)
         left = (self.steps - step) / max(rate, 1e-9) / 60
+        recent = [loss for loss in losses[-100:] if np.isfinite(loss)]
         click.echo(
-            f"step {step}/{self.steps}  loss {np.nanmean(losses[-100:]):.4f}  "
+            f"step {step}/{self.steps}  loss {np.mean(recent or [np.nan]):.4f}  "
             f"{rate * self.per_step:.2f} {self.what}/s  {left:.0f} min left",
             err=True,
         )

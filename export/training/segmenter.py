@@ -7,6 +7,8 @@ the step: a run that was stopped goes on where it was.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,11 +18,18 @@ import numpy as np
 import torch
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import SIDE, training_pair
 from gcar_export.scenes.augmented import augmented_pair
-from gcar_export.scenes.expert_pictures import ExpertPicture, expert_pair, expert_pictures, folds
+from gcar_export.scenes.expert_pictures import (
+    ExpertPicture,
+    expert_pair,
+    expert_pictures,
+    fold_edges,
+    folds,
+)
 from gcar_export.scenes.picture_pool import pooled
-from gcar_export.training.loop import Lesson, Schedule, learn
+from gcar_export.training.loop import Lesson, Schedule, learn_together
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.run_folder import RunFolder
 from gcar_export.training.segmenter_start import begin_with
@@ -41,6 +50,8 @@ class SegmenterOptions:
     device : str, where torch works: ``cpu`` or ``cuda``
     real : str, folder of real angiograms with expert masks (``expert_pictures``); empty for none
     fold : (number, of how many) that is left out of them; (0, 0) leaves none out
+    folds : int, networks that are trained beside it on the same batches, each without one of so
+        many parts of the real pictures: what they say of it is said out of fold; 0 for none
     real_share : float, of the pictures of a step, where there are real ones
     pictures : int, generated ones that are drawn; each is used many times, never twice the same
     mean_steps : int, what is kept is the mean of the weights over about so many (``mean_weights``)
@@ -61,22 +72,24 @@ class SegmenterOptions:
     device: str = "cpu"
     real: str = ""
     fold: tuple[int, int] = (0, 0)
+    folds: int = 0
     real_share: float = 0.5
     pictures: int = 1500
     crop: int = 224
 
 
-#: two cores for an hour; a GPU with the cores to draw pictures for it
+#: two cores for an hour; a GPU with 16 cores to draw pictures for it, ten minutes
 PRESETS = {
     "cpu": SegmenterOptions(),
     "gpu": SegmenterOptions(
-        steps=20_000,
-        decay_steps=12_000,
-        warmup_steps=500,
-        batch=48,
-        pictures=20_000,
+        steps=4000,
+        decay_steps=2700,
+        warmup_steps=200,
+        batch=32,
+        pictures=6000,
+        crop=SIDE,
         device="cuda",
-        save_every=500,
+        save_every=1000,
     ),
 }
 #: three steps, for tests
@@ -180,6 +193,8 @@ class Stream(torch.utils.data.Dataset):
     """Pictures 0 .. of a stream, made where and when they are asked for.
 
     Of each ``batch`` the first ``real_share`` are crops of real pictures, where there are any.
+    An item is input, truth (both in half precision), and the number of the real picture, -1 for a
+    generated one.
     """
 
     def __init__(
@@ -190,11 +205,11 @@ class Stream(torch.utils.data.Dataset):
     def __len__(self) -> int:
         return self.options.steps * self.options.batch
 
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor, int]:
         cv2.setNumThreads(1)
-        batch, seed = self.options.batch, self.options.seed
+        batch, seed, number = self.options.batch, self.options.seed, -1
         if self.real and index % batch < round(self.options.real_share * batch):
-            x, y = expert_pair(self.real, seed, index)
+            x, y, number = expert_pair(self.real, seed, index)
         else:
             rng = np.random.default_rng([seed, index, 5])
             # The first steps need not wait for the whole pool.
@@ -205,21 +220,33 @@ class Stream(torch.utils.data.Dataset):
             0, SIDE - self.options.crop + 1, 2
         )
         part = slice(top, top + self.options.crop), slice(left, left + self.options.crop)
-        return torch.from_numpy(x[:, *part].copy()), torch.from_numpy(y[:, *part].copy())
+        cut = (torch.from_numpy(a[:, *part].astype(np.float16)) for a in (x, y))
+        return next(cut), next(cut), number
 
 
 def batches(
     options: SegmenterOptions, pool: Path, real: Sequence[ExpertPicture], first_step: int,
     workers: int,
 ) -> Iterator[list[torch.Tensor]]:  # fmt: skip
-    """Yield inputs (batch, 3, n, n) and truths (batch, 6, n, n) of each step from the first on."""
+    """Yield each step's inputs (batch, 3, n, n), truths (batch, 6, n, n) and picture numbers.
+
+    The last (batch,), as ``Stream`` gives them; the others are where torch works.
+    """
     order = [
         list(range(k * options.batch, (k + 1) * options.batch))
         for k in range(first_step, options.steps)
     ]
-    yield from torch.utils.data.DataLoader(
-        Stream(options, pool, real), batch_sampler=order, num_workers=workers
-    )
+    loader = torch.utils.data.DataLoader(
+        Stream(options, pool, real), batch_sampler=order, num_workers=workers,
+        pin_memory=options.device != "cpu",
+    )  # fmt: skip
+    for x, y, numbers in loader:
+        yield [a.to(options.device, non_blocking=True) for a in (x, y)] + [numbers]
+
+
+@functools.cache
+def _held_out(count: int) -> list[tuple[Array, Array]]:
+    return [training_pair(VALIDATION_SEED, k) for k in range(count)]
 
 
 @torch.no_grad()
@@ -227,8 +254,8 @@ def validate(net: MaskUNet, options: SegmenterOptions) -> float:
     """Mean Dice at 0.5 over held-out generated pictures."""
     net.eval()
     scores = []
-    for k in range(options.validation_pictures):
-        x, y = (torch.from_numpy(a).to(options.device) for a in training_pair(VALIDATION_SEED, k))
+    for pair in _held_out(options.validation_pictures):
+        x, y = (torch.from_numpy(a).to(options.device) for a in pair)
         asked = y[1] > 0
         found, true = (net(x[None])[0, 0] >= 0) & asked, (y[0] >= 0.5) & asked
         both = float((found & true).sum())
@@ -260,39 +287,72 @@ def train(
     """Train or go on training in ``out``; stop after ``minutes`` if given.
 
     The decay is a function of the step, so a run cut short has not settled: ``finish`` it by a
-    call with fewer ``steps``. A new run begins with the weights of ``begin_from`` if given, a
-    checkpoint or an ONNX model. Generated pictures are kept in ``pool``, by default in ``out``.
+    call with fewer ``steps``. Networks of ``options.folds`` are in folders within it. A new run
+    begins with the weights of ``begin_from`` if given, a checkpoint or an ONNX model. Generated
+    pictures are kept in ``pool``, by default in ``out``.
     """
     cv2.setNumThreads(1)
-    torch.manual_seed(options.seed)
     real = real_pictures(options.real, options.fold)
-    net = MaskUNet(MaskUNetConfig()).to(options.device).train()
-    # channels_last only orders the memory; the stubs of Module.to do not know it
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    started = None if begin_from is None else begin_with(net, begin_from)
-    folder = RunFolder(
-        out,
-        {
-            "network": "mask-unet",
-            "config": dataclasses.asdict(net.config),
-            "seed": options.seed,
-            "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
-            "warm_start": started,
-            "data": "generated angiograms: gcar_export.scenes.picture_pool"
-            + ("; crops of real ones with expert masks" if options.real else ""),
-            "validation_seed": VALIDATION_SEED,
-        },
-    )
-    lesson: Lesson[MaskUNet, list[torch.Tensor]] = Lesson(
-        lambda step: batches(options, pool or out / "pool", real, step, workers),
-        lambda pair: _loss(net, pair, options),
-        lambda mean: {"dice": validate(mean, options)},
-    )
-    learn(folder, net, options, lesson, minutes)
+
+    def batches_from(step: int) -> Iterator[list[torch.Tensor]]:
+        return batches(options, pool or out / "pool", real, step, workers)
+
+    pupils = []
+    for fold, left_out in left_out_by(options, len(real)):
+        torch.manual_seed(options.seed)
+        net = MaskUNet(MaskUNetConfig()).to(options.device).train()
+        # channels_last only orders the memory; the stubs of Module.to do not know it
+        net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        started = None if begin_from is None else begin_with(net, begin_from)
+        lesson: Lesson[MaskUNet, list[torch.Tensor]] = Lesson(
+            batches_from,
+            functools.partial(_loss, net, options, left_out),
+            lambda mean: {"dice": validate(mean, options)},
+        )
+        own = dataclasses.replace(options, fold=fold)
+        where = out if fold == options.fold else out / f"fold-{fold[0]}-of-{fold[1]}"
+        pupils.append((RunFolder(where, _manifest(net, own, started)), net, lesson))
+    learn_together(pupils, options, minutes)
 
 
-def _loss(net: MaskUNet, pair: Sequence[torch.Tensor], options: SegmenterOptions) -> torch.Tensor:
-    x, y = pair[0].to(options.device, memory_format=torch.channels_last), pair[1].to(options.device)
+def left_out_by(options: SegmenterOptions, count: int) -> list[tuple[tuple[int, int], range]]:
+    """Return each network's fold and the numbers of the ``count`` real pictures it leaves out.
+
+    Raises
+    ------
+    UsageError
+        Folds of no pictures, of fewer than there are folds, or of those that a fold leaves.
+    """
+    of = options.folds
+    if of and (options.fold != (0, 0) or not 2 <= of <= count):
+        raise UsageError(f"folds {of}: must be 2 .. {count} of the real pictures, without --fold")
+    edges = fold_edges(count, of).tolist() if of else []
+    return [(options.fold, range(0))] + [
+        ((k + 1, of), range(low, high)) for k, (low, high) in enumerate(itertools.pairwise(edges))
+    ]
+
+
+def _manifest(net: MaskUNet, options: SegmenterOptions, started: str | None) -> dict[str, Any]:
+    return {
+        "network": "mask-unet",
+        "config": dataclasses.asdict(net.config),
+        "seed": options.seed,
+        "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
+        "warm_start": started,
+        "data": "generated angiograms: gcar_export.scenes.picture_pool"
+        + ("; crops of real ones with expert masks" if options.real else ""),
+        "validation_seed": VALIDATION_SEED,
+    }
+
+
+def _loss(
+    net: MaskUNet, options: SegmenterOptions, left_out: range, batch: Sequence[torch.Tensor]
+) -> torch.Tensor | None:
+    """Loss of a batch without what the network must not see; None where nothing is left."""
+    keep = [k for k, number in enumerate(batch[2].tolist()) if number not in left_out]
+    if not keep:
+        return None
+    x, y = (a[keep].float() for a in batch[:2])
     with torch.autocast(options.device, torch.bfloat16, enabled=options.bfloat16):
-        maps = net(x)
+        maps = net(x.to(memory_format=torch.channels_last))
     return total_loss(maps.float(), y)

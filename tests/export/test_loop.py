@@ -10,7 +10,12 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 
 from safetensors.torch import load_file  # noqa: E402
 
-from gcar_export.training.loop import Lesson, learn, learning_rate  # noqa: E402
+from gcar_export.training.loop import (  # noqa: E402
+    Lesson,
+    learn,
+    learn_together,
+    learning_rate,
+)
 from gcar_export.training.run_folder import RunFolder  # noqa: E402
 from gcar_export.training.segmenter import TINY, SegmenterOptions  # noqa: E402
 
@@ -73,6 +78,33 @@ def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
     assert one.keys() == two.keys()
     for name, value in one.items():
         np.testing.assert_array_equal(value, two[name], err_msg=name)
+
+
+def test_networks_that_learn_together_end_as_each_would_alone(tmp_path):
+    """Also where an interruption left the first ahead of the second."""
+
+    def pupils(root, steps):
+        whole, part = line(), line()
+        own, other = lesson(whole, steps=steps), lesson(part, [], steps)
+        return [(RunFolder(root / "whole", MANIFEST), whole, own),
+                (RunFolder(root / "part", MANIFEST), part, other)]  # fmt: skip
+
+    for folder, net, own in pupils(tmp_path / "alone", 60):
+        learn(folder, net, options(), own)
+    for one, steps in ((0, 31), (1, 20)):
+        folder, net, own = pupils(tmp_path / "both", steps)[one]
+        learn(folder, net, options(), own)
+    learn_together(pupils(tmp_path / "both", 60), options())
+    ends = []
+    for name in ("whole", "part"):
+        alone, both = (
+            load_file(tmp_path / root / name / "checkpoint.safetensors")
+            for root in ("alone", "both")
+        )
+        ends.append(float(both["net.weight"]))
+        for key, value in alone.items():
+            np.testing.assert_array_equal(value, both[key], err_msg=f"{name} {key}")
+    assert ends[0] != ends[1]
 
 
 def test_a_gradient_that_is_not_finite_moves_nothing(tmp_path):

@@ -17,7 +17,7 @@ class MaskUNetConfig:
     """Channels of the input and of each level, fine to coarse."""
 
     channels: int = 3
-    width: tuple[int, ...] = (16, 32, 48, 96, 128)
+    width: tuple[int, ...] = (16, 32, 64, 128, 192)
 
 
 class Pair(nn.Sequential):
