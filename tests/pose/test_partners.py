@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.imaging.stray_lines import without_line
-from gcar_deploy.pose.partners import LIKELY, partnered
+from gcar_deploy.pose.partners import BACK_GAIN, GAIN, LIKELY, partnered
 from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, view_of
 
 AGREED, ENOUGH = 0.05, 0.1
@@ -78,7 +78,12 @@ def test_what_both_views_call_a_device_goes_if_without_both_they_agree_better(sa
 
 @pytest.mark.parametrize(
     ("before", "share", "back"),
-    [(2 * ENOUGH, 0.5, True), (2 * ENOUGH, 0.95, False), (AGREED, 0.5, False)],
+    [
+        (2 * ENOUGH, GAIN - 0.01, True),
+        (2 * ENOUGH, 0.95, False),
+        (AGREED, BACK_GAIN - 0.01, True),
+        (AGREED, BACK_GAIN + 0.01, False),
+    ],
 )
 def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before, share, back):
     whole = crossed(0.0)
