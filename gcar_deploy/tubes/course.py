@@ -36,31 +36,35 @@ def cheapest_course(
     total : float
     """
     places, depths = cost.shape
-    slopes = range(-MOST_SLOPE, MOST_SLOPE + 1)
+    slopes = np.arange(-MOST_SLOPE, MOST_SLOPE + 1)
     numbers = np.arange(len(slopes))
-    rise = np.array(slopes) * depth_step / place_step
+    rise = slopes * depth_step / place_step
     angle, longer = np.arctan(rise), np.sqrt(1.0 + rise * rise)
-    turns = 0.5 * (angle[:, None] - angle) ** 2 / (turn * turn * place_step)
-    turns[np.abs(numbers[:, None] - numbers) > MOST_CHANGE] = math.inf
+    # Column ``number`` of a beam so padded is the slope that is ``MOST_CHANGE`` less.
+    beside = np.pad(angle, MOST_CHANGE, constant_values=math.inf)
+    turns = [
+        0.5 * (beside[k : k + len(slopes)] - angle) ** 2 / (turn * turn * place_step)
+        for k in range(2 * MOST_CHANGE + 1)
+    ]
+    source = np.arange(depths)[:, None] - slopes
+    outside = (source < 0) | (source >= depths)
+    flat = np.clip(source, 0, depths - 1) * len(slopes) + numbers
     # Any slope is as good as another to begin with.
     value = np.repeat((cost[0] + start)[:, None], len(slopes), axis=1)
+    padded = np.full((depths, len(beside)), math.inf)
     before: list[Array] = []
     for place in range(1, places):
-        reached = np.full_like(value, math.inf)
-        came = np.zeros(value.shape, np.int64)
-        for number, slope in enumerate(slopes):
-            lowest = max(number - MOST_CHANGE, 0)
-            near = slice(lowest, number + MOST_CHANGE + 1)
-            ways = value[:, near] + turns[near, number]
-            best = ways.argmin(axis=1)
-            low = min(max(-slope, 0), depths)
-            high = max(depths - max(slope, 0), low)
-            to = slice(low + slope, high + slope)
-            least = np.take_along_axis(ways, best[:, None], axis=1)[:, 0]
-            reached[to, number] = least[low:high] + cost[place, to] * longer[number]
-            came[to, number] = best[low:high] + lowest
-        value = reached
-        before.append(came)
+        padded[:, MOST_CHANGE:-MOST_CHANGE] = value
+        least = padded[:, : len(slopes)] + turns[0]
+        best = np.zeros(value.shape, np.int64)
+        for k, turning in enumerate(turns[1:], start=1):
+            way = padded[:, k : k + len(slopes)] + turning
+            better = way < least
+            np.copyto(least, way, where=better)
+            np.copyto(best, k, where=better)
+        value = least.take(flat) + cost[place][:, None] * longer
+        value[outside] = math.inf
+        before.append(best.take(flat) + numbers - MOST_CHANGE)
     depth, number = (int(k) for k in np.unravel_index(value.argmin(), value.shape))
     total = float(value[depth, number])
     course = [depth]

@@ -7,6 +7,7 @@ tree that hang on nothing are given up on trial, and their lines proposed anew, 
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,7 +17,7 @@ from gcar_deploy.tree.edit import kept_branches
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.gauss_newton import rescaled
 from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
-from gcar_deploy.tubes.proposal import Proposal, Told, proposal
+from gcar_deploy.tubes.proposal import Told, proposal
 from gcar_deploy.tubes.run import Run, State, Trial
 from gcar_deploy.tubes.targets import Target
 
@@ -58,37 +59,55 @@ def _with_missed(
     now: Trial, views: Sequence[VesselImage], targets: list[Target], run: Run, told: Told
 ) -> Trial:
     """Add the lines that no tube explains, the likeliest first, each where it earns its place."""
-    better: Trial | None = now
-    while better is not None and not run.progress.stopped:
-        now, better = better, None
-        for found in _proposals(now.state, views, targets, told):
-            trial = run.tried(found.added(now.tree), targets)
-            if run.progress.stopped:
-                break
-            price = EARNED * now.loss
-            if not _exact(targets):
-                price = max(price, EARNED_PER_MM * (trial.tree.length_mm - now.tree.length_mm))
-            if trial.loss < now.loss - price:
-                better = trial
-                break
+    before: Trial | None = None
+    while before is not now and not run.progress.stopped:
+        before = now
+        now = _with_some(now, views, targets, run, told)
     return now
 
 
-def _proposals(
-    now: State, views: Sequence[VesselImage], targets: list[Target], told: Told
-) -> list[Proposal]:
-    """Return what the lines that no tube explains could be, the likeliest first."""
-    looks, lines = _lines(now, views, targets)
-    found = (proposal(line, looks, now.tree, told) for line in lines)
-    return sorted((one for one in found if one is not None), key=lambda one: one.cost)
+def _with_some(
+    now: Trial, views: Sequence[VesselImage], targets: list[Target], run: Run, told: Told
+) -> Trial:
+    """Ask each line that no tube explains once, the likeliest first."""
+    looks, lines = _lines(now.state, views, targets)
+    found = ((number, proposal(line, looks, now.tree, told)) for number, line in enumerate(lines))
+    # Equal costs in the order of the lines.
+    asked = [(one.cost, number, one, now) for number, one in found if one is not None]
+    heapq.heapify(asked)
+    while asked:
+        _, number, one, of = heapq.heappop(asked)
+        if of is not now:
+            # The tree has grown: this may be explained by now, or no more the likeliest.
+            again = proposal(lines[number], looks, now.tree, told)
+            if again is None:
+                continue
+            if asked and asked[0][0] < again.cost:
+                heapq.heappush(asked, (again.cost, number, again, now))
+                continue
+            one = again
+        trial = run.tried(one.added(now.tree), targets)
+        if run.progress.stopped:
+            break
+        price = EARNED * now.loss
+        if not _exact(targets):
+            price = max(price, EARNED_PER_MM * (trial.tree.length_mm - now.tree.length_mm))
+        if trial.loss < now.loss - price:
+            now = trial
+            looks = _looks(now.state, views, targets)
+    return now
 
 
 def _lines(
     now: State, views: Sequence[VesselImage], targets: list[Target]
 ) -> tuple[list[Look], list[MissedLine]]:
     """Compare pictures with tubes, and return the lines that none explains."""
-    looks = looked_at(views, rescaled(targets, now.prints), now.prints)
+    looks = _looks(now, views, targets)
     return looks, missed_lines(looks)
+
+
+def _looks(now: State, views: Sequence[VesselImage], targets: list[Target]) -> list[Look]:
+    return looked_at(views, rescaled(targets, now.prints), now.prints)
 
 
 def _hung(
