@@ -291,9 +291,10 @@ class Reconstruction:
             "exchangeable": [
                 {
                     "branches": [k + 1 for k in pair.branches],
+                    "stretches_mm": [list(stretch) for stretch in pair.stretches_mm],
                     "middles_mm": [
-                        self._place(k, 0.5 * length)
-                        for k, length in zip(pair.branches, pair.lengths_mm, strict=True)
+                        self._place(k, 0.5 * sum(stretch))
+                        for k, stretch in zip(pair.branches, pair.stretches_mm, strict=True)
                     ],
                     "difference": pair.difference,
                 }

@@ -126,7 +126,8 @@ def judge(
     RefusedError
         As ``assess`` and ``check_scale``.
     """
-    open_ = alternatives.exchanges(tree, [view.carm for view in views])
+    masks = kind_of(views) == "mask"
+    open_ = alternatives.exchanges(tree, [view.carm for view in views], masks=masks)
     shown = Shown(tree, views, evidence)
     elsewhere = alternatives.evidence_elsewhere(shown)
     ghosts = find_ghosts(shown)

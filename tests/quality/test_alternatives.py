@@ -5,9 +5,11 @@ import pytest
 
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict import Evidence
-from gcar_deploy.quality.alternatives import evidence_elsewhere, exchanges, findings
+from gcar_deploy.quality.alternatives import evidence_elsewhere, exchanges, findings, turning_points
 from gcar_deploy.quality.shown import Shown
+from gcar_deploy.tree.tree import Tree
 from tests.hard.phantoms import PAIR, bars, carm, seven, straight
+from tests.tree.shapes import branch
 
 VIEWS = (carm(-40), carm(45))
 
@@ -37,6 +39,39 @@ def test_vessels_that_differ_in_mass_or_place_cannot_be_exchanged(change):
     else:
         second = dataclasses.replace(second, points_mm=second.points_mm + np.array([0, 0, 12.0]))
     assert exchanges(dataclasses.replace(two, branches=(first, second)), VIEWS) == ()
+
+
+def hairpin(thinner: float = 1.0):
+    """A vessel that comes down, turns and goes up again, 50 mm each way, and its two radii."""
+    turn = np.linspace(0, np.pi, 40)
+    z = np.linspace(40, -10, 60)
+    down = np.stack([-8 + 0.0 * z, 3 + 0 * z, z], 1)
+    round_ = np.stack([-8 * np.cos(turn), 3 * np.cos(turn), -10 - 8 * np.sin(turn)], 1)
+    up = np.stack([8 + 0 * z, -3 + 0 * z, z[::-1]], 1)
+    line = np.concatenate([down, round_[1:-1], up])
+    radius = np.where(np.arange(len(line)) < len(line) // 2, 1.4, 1.4 * thinner)
+    return Tree(nodes_mm=line[[0, -1]], branches=(branch(line, radius),))
+
+
+def test_the_two_ways_of_a_vessel_that_turns_back_can_be_exchanged():
+    """A loop that closes where it turns: as masks show it, no width says which way is which."""
+    for masks in (False, True):
+        (one,) = exchanges(hairpin(), VIEWS, masks=masks)
+        (start, turn), (again, end) = one.stretches_mm
+        assert one.branches == (0, 0) and start == 0 and turn == again
+        assert 55 < turn < 75 and end > 120
+    (sentence,) = findings([one], None)
+    assert "both of branch 1" in sentence
+    assert exchanges(hairpin(0.8), VIEWS, masks=True) == ()
+
+
+def test_a_series_turns_back_where_it_goes_on_far_enough():
+    up = np.arange(0.0, 10.0)
+    assert turning_points(up, 4.0) == [0, 9]
+    assert turning_points(-up, 4.0) == [0, 9]
+    assert turning_points(np.concatenate([up, up[-2::-1], up[1:]]), 4.0) == [0, 9, 18, 27]
+    assert turning_points(np.concatenate([up, 9 - 0.3 * up]), 4.0) == [0, 19]
+    assert turning_points(np.concatenate([3 - up[:4], up]), 4.0) == [0, 13]
 
 
 def test_evidence_on_the_tree_and_beside_it():

@@ -35,7 +35,7 @@ def nearest_branch(result, place):
 def test_marks_of_an_exchange_lie_on_both_vessels_in_one_epipolar_plane(result):
     carms = tuple(view.carm for view in result.views)
     first, second = result.tree.branches[0], result.tree.branches[1]
-    marks = exchange_marks(first, second, carms)
+    marks = exchange_marks(first.points_mm, second.points_mm, carms)
     for mark, branches in zip(marks, ((first, second), (second, first)), strict=True):
         for carm, branch, point in zip(carms, branches, mark, strict=True):
             gaps = np.linalg.norm(carm.project(branch.points_mm)[0] - point, axis=1)
@@ -53,8 +53,9 @@ def test_every_alternative_of_a_result_is_told_with_what_picks_it(result):
     ghost = with_ghost(result)
     branches = ghost.tree.branches
     exchange = Exchange(
-        branches=(0, 1), lengths_mm=(branches[0].length_mm, branches[1].length_mm), difference=0.1
-    )
+        branches=(0, 1), difference=0.1,
+        stretches_mm=((0.0, branches[0].length_mm), (0.0, branches[1].length_mm)),
+    )  # fmt: skip
     middle = branches[1].points_mm[len(branches[1]) // 2]
     made = dataclasses.replace(
         ghost,
