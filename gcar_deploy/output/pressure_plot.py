@@ -15,12 +15,15 @@ _WIDTH, _HEIGHT = 760, 344
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 744, 32, 300
 #: no more points a curve
 _POINTS = 120
+#: ... and no more than so many branches by their numbers
+_NAMED = 20
 
 
 def pressure_svg(drop: PressureDrop) -> str:
     """Draw every branch as far as its interval is narrow enough for a value.
 
-    Lines are Pd/Pa, bands its interval; where nothing may be told, the picture says so.
+    Lines are Pd/Pa, bands its interval; where nothing may be told, the picture says so, and it
+    names the branches of whose far end nothing may.
     """
     shown = [(k, v) for k, v in enumerate(drop.vessels) if np.count_nonzero(v.told) > 1]
     reach = max((float(v.arc_mm[v.told][-1]) for _, v in shown), default=10.0)
@@ -56,6 +59,13 @@ def pressure_svg(drop: PressureDrop) -> str:
     )
     for k, vessel in shown:
         parts += _curve(k, vessel, x, y)
+    withheld = [str(k + 1) for k, v in enumerate(drop.vessels) if v.withheld]
+    if shown and withheld:
+        some = ", ".join(withheld[:_NAMED]) + (", ..." if len(withheld) > _NAMED else "")
+        whose = "branch" if len(withheld) == 1 else "branches"
+        parts.append(
+            f'<text x="4" y="{_HEIGHT - 8}">no value at the far end of {whose} {some}</text>'
+        )
     if not shown:
         parts.append(
             f'<text x="{_WIDTH / 2}" y="{_HEIGHT / 2}" text-anchor="middle">no value may be told; '

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import itertools
 import json
@@ -11,6 +12,7 @@ import pytest
 
 from gcar_deploy.measure import from_inlets
 from gcar_deploy.output.handover import handover_files
+from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.tree.surface import Surface
 from tests.flow.trees import drop_of, solved, stenosed, stenosed_fork
 from tests.measure.test_naming import left_tree
@@ -265,3 +267,16 @@ def test_axes_have_units(made):
     text = made[2]["pressure.svg"].decode()
     assert "mm from the ostium" in text and "Pd/Pa (dimensionless)" in text
     assert "ffr" not in text.lower()
+
+
+def test_the_picture_names_the_branches_without_a_value_at_their_far_end(made):
+    drop = made[1]
+    first = dataclasses.replace(drop.vessels[0], withheld="")
+    others = [
+        dataclasses.replace(v, withheld="", doubtful=False, high=v.low) for v in drop.vessels[1:]
+    ]
+    whole = dataclasses.replace(drop, vessels=(first, *others))
+    assert "far end" not in pressure_svg(whole)
+    wide = dataclasses.replace(others[-1], withheld="too wide")
+    told = pressure_svg(dataclasses.replace(whole, vessels=(first, *others[:-1], wide)))
+    assert f"no value at the far end of branch {len(drop.vessels)}<" in told
