@@ -56,6 +56,9 @@ def agreeing(
     def estimate(tried: Sequence[VesselImage]) -> tuple[Pose, ...]:
         return poses_between(tried, options)
 
+    def judge(tried: Sequence[VesselImage], placed: Sequence[Pose]) -> tuple[Pose, ...]:
+        return poses_between(tried, options, placed)
+
     seen: Sequence[VesselImage] = views
     first = poses = estimate(views)
     for readings in (_by_method, _likeliest):
@@ -63,7 +66,9 @@ def agreeing(
         seen, poses = _closest(tried, poses, readings(views, first, options), options)
         if seen is tried and readings is _likeliest:
             break
-        fewer, closer = partnered(seen, poses, asked, limits.parts_disagreement_raw, estimate)
+        fewer, closer = partnered(
+            seen, poses, asked, limits.parts_disagreement_raw, estimate, judge
+        )
         if max(p.after for p in closer) <= limits.good_disagreement_raw:
             return fewer, closer, _changed(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.

@@ -38,12 +38,16 @@ LIKELY, INSIDE, LIKELY_GAIN = 0.5, 0.5, 0.95
 KEPT_SHARE = 0.5
 #: of a view's lines the longest are asked
 MOST_LINES = 8
+#: three and more views are fitted together, which takes a second: of what could change those ways
+#: are fitted, so many a round, with which the views agree best where they stand
+MOST_FITTED = 4
 Views: TypeAlias = "Sequence[VesselImage]"
 
 
 def partnered(
     views: Sequence[VesselImage], poses: tuple[Pose, ...], asked: Sequence[bool], enough: float,
-    estimate: Callable[[Sequence[VesselImage]], tuple[Pose, ...]],
+    estimate: Callable[[Views], tuple[Pose, ...]],
+    judge: Callable[[Views, tuple[Pose, ...]], tuple[Pose, ...]],
 ) -> tuple[list[VesselImage], tuple[Pose, ...]]:  # fmt: skip
     """Leave out likely devices, and lines that no other view shows until the views agree enough.
 
@@ -57,6 +61,7 @@ def partnered(
     enough : disagreement, 0 .. 1, from which on a line has to be a likely device to go, and to
         change more to come back
     estimate : poses of such views
+    judge : poses of such views as they are, with what the views say of them
 
     Returns
     -------
@@ -67,7 +72,7 @@ def partnered(
     # Few views change from round to round.
     fewer_of, more_of = functools.cache(_fewer), functools.cache(_more)
     while True:
-        worst = max(pose.after for pose in poses)
+        worst = _worst(poses)
         fewer = [
             fewer_of(view, few) if may else ()
             for view, few, may in zip(now, least, asked, strict=True)
@@ -82,16 +87,20 @@ def partnered(
         tried += [(each, gain) for each in _one_of(now, more)]
         if not tried:
             break
+        if len(now) > 2:
+            tried.sort(key=lambda one: _worst(judge(one[0], poses)) / one[1])
+            del tried[MOST_FITTED:]
         found = [estimate(each) for each, _ in tried]
-        after = [
-            max(pose.after for pose in some) / gain
-            for some, (_, gain) in zip(found, tried, strict=True)
-        ]
+        after = [_worst(some) / gain for some, (_, gain) in zip(found, tried, strict=True)]
         best = after.index(min(after))
         if after[best] > worst:
             break
         now, poses = tried[best][0], found[best]
     return now, poses
+
+
+def _worst(poses: Sequence[Pose]) -> float:
+    return max(pose.after for pose in poses)
 
 
 def _one_of(views: Views, instead: Sequence[Views]) -> Iterator[list[VesselImage]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.imaging.stray_lines import without_line
-from gcar_deploy.pose.partners import BACK_GAIN, GAIN, LIKELY, partnered
+from gcar_deploy.pose.partners import BACK_GAIN, GAIN, LIKELY, MOST_FITTED, partnered
 from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, view_of
 
 AGREED, ENOUGH = 0.05, 0.1
@@ -32,6 +32,10 @@ def poses(after: float):
     return (SimpleNamespace(after=0.0), SimpleNamespace(after=after))
 
 
+def never(tried, poses):
+    raise AssertionError("two views are fitted at once")
+
+
 def asked(said, after, may=(True, True)):
     """Which of two views keep the line, where ``after`` says how well views with so many agree."""
     views = [crossed(one) for one in said]
@@ -39,7 +43,7 @@ def asked(said, after, may=(True, True)):
     def estimate(tried):
         return poses(after(*(there(view) for view in tried)))
 
-    kept, found = partnered(views, estimate(views), may, ENOUGH, estimate)
+    kept, found = partnered(views, estimate(views), may, ENOUGH, estimate, never)
     assert found[1].after == after(*(there(view) for view in kept))
     return [there(view) for view in kept]
 
@@ -94,8 +98,37 @@ def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before,
     def estimate(tried):
         return poses(share * before if there(tried[0]) else before)
 
-    kept, found = partnered(views, estimate(views), (True, False), ENOUGH, estimate)
+    kept, found = partnered(views, estimate(views), (True, False), ENOUGH, estimate, never)
     assert there(kept[0]) == back and kept[1] is views[1]
     assert found[1].after == (share * before if back else before)
     # A picture whose mask the user gave is left alone.
-    assert partnered(views, estimate(views), (False, False), ENOUGH, estimate)[0][0] is views[0]
+    left = partnered(views, estimate(views), (False, False), ENOUGH, estimate, never)[0]
+    assert left[0] is views[0]
+
+
+def test_of_three_and_more_views_what_agrees_best_where_they_stand_is_fitted():
+    """Four views of a line that is likely a device, each with two ways to leave it out."""
+    views = [crossed(SURE) for _ in range(4)]
+    fitted, placed = [], []
+
+    def agreed(tried):
+        # Without the last one they agree best, and the fit says so too.
+        return poses((0.5 if not there(tried[3]) else 0.9) * AGREED + 0.001 * len(where(tried)))
+
+    def where(tried):
+        return [k for k, view in enumerate(tried) if not there(view)]
+
+    def estimate(tried):
+        fitted.append(where(tried))
+        return agreed(tried)
+
+    def judge(tried, known):
+        placed.append(where(tried))
+        return agreed(tried)
+
+    start = poses(AGREED)
+    kept, found = partnered(views, start, (True,) * 4, ENOUGH, estimate, judge)
+    assert where(kept) == [3] and found[1].after == pytest.approx(0.5 * AGREED + 0.001)
+    # One or two views without it: 8 + 24 ways at first, and 6 + 12 of three views that are left.
+    assert len(placed) == 32 + 18 and len(fitted) == 2 * MOST_FITTED
+    assert all(3 in one for one in fitted)
