@@ -116,7 +116,7 @@ def _reconstructed(
         vessels = find_vessels(angiograms, options.imaging, segmenter, watch, report)
         keep(vessels)
     with watch.stage("pose"):
-        placed = register(angiograms, vessels.views, options, tree_of)
+        placed = register(angiograms, vessels.views, options, tree_of, watch.check)
         keep(placed)
         placed.or_refuse()
         options = placed.marks(options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -30,7 +30,10 @@ METHODS = 2
 
 
 def agreeing(
-    angiograms: Sequence[Angiogram], views: Sequence[VesselImage], options: RunOptions
+    angiograms: Sequence[Angiogram],
+    views: Sequence[VesselImage],
+    options: RunOptions,
+    check: Callable[[], None] | None = None,
 ) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
     """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
 
@@ -38,7 +41,8 @@ def agreeing(
     counterpart; then without lines that no other view shows, and with those that were taken for
     devices and that another view shows (``partners``). Where they contradict
     each other still, the same from any reading of either view, and then from widths alone. Nothing
-    of a mask that the user gave is left out.
+    of a mask that the user gave is left out. ``check`` is called before each estimate, and may
+    raise.
 
     Returns
     -------
@@ -54,6 +58,8 @@ def agreeing(
     limits = options.quality
 
     def estimate(tried: Sequence[VesselImage]) -> tuple[Pose, ...]:
+        if check is not None:
+            check()
         return poses_between(tried, options)
 
     def judge(tried: Sequence[VesselImage], placed: Sequence[Pose]) -> tuple[Pose, ...]:

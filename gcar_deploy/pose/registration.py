@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from gcar_deploy.config import Landmark, RunOptions
 from gcar_deploy.errors import RefusedError
@@ -78,6 +78,7 @@ def register(
     views: Sequence[VesselImage],
     options: RunOptions,
     tree_of: TreeOf,
+    check: Callable[[], None] | None = None,
 ) -> Registered:
     """Estimate where the views stand, and judge whether they can show one tree.
 
@@ -88,6 +89,7 @@ def register(
     options : RunOptions
     tree_of : makes a quick tree of views that have their corrections built in; asked only for
         three and more views that do not agree as they are told
+    check : raises where the caller wants out; asked between estimates
 
     Returns
     -------
@@ -95,7 +97,7 @@ def register(
         Also of views that contradict each other: ``or_refuse`` raises then.
     """
     given = views
-    views, poses, findings = agreeing(angiograms, given, options)
+    views, poses, findings = agreeing(angiograms, given, options, check)
     rigid = bundled(views, poses, tree_of, options)
     order, hint = order_of(views, rigid, options)
     findings += order

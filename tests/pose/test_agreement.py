@@ -7,6 +7,7 @@ import pytest
 from scipy import ndimage
 
 from gcar_deploy.config import PoseOptions, RunOptions
+from gcar_deploy.errors import CancelledError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
@@ -248,3 +249,18 @@ def test_a_reading_that_shows_a_part_alone_does_not_stand_for_the_tree():
     tried = [dataclasses.replace(v, others=(p,)) for v, p in zip(views, parts, strict=True)]
     for new, old in zip(agreeing(angiograms, tried, OPTIONS)[0], tried, strict=True):
         assert new is old
+
+
+def test_who_wants_out_gets_out_between_two_estimates():
+    """What lines are left out takes an estimate for each: many, with several views."""
+    angiograms, views = pair(stranger=True)
+    asked = []
+
+    def check():
+        asked.append(len(asked))
+        if len(asked) == 2:
+            raise CancelledError("cancelled by the caller")
+
+    with pytest.raises(CancelledError):
+        agreeing(angiograms, views, OPTIONS, check)
+    assert len(asked) == 2
