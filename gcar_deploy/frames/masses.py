@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.consistency import BIN_MM, HALF_BINS
-from gcar_deploy.geometry.epipolar import plane_axes, slices_along
+from gcar_deploy.geometry.epipolar import plane_axes, reach_mm, slices_along
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.angiogram import Angiogram
@@ -106,11 +106,8 @@ def plane_profiles(first: RunMasses, second: RunMasses) -> tuple[Array, Array]:
     (n, 2 HALF_BINS + 1), (m, 2 HALF_BINS + 1), zero for frames without contrast
     """
     axes = plane_axes(first.carm, second.carm)
-    sources = np.linalg.norm([first.carm.source_mm, second.carm.source_mm], axis=1)
-    return (
-        _profiles(first, axes, float(sources.mean())),
-        _profiles(second, axes, float(sources.mean())),
-    )
+    reach = reach_mm(first.carm, second.carm)
+    return _profiles(first, axes, reach), _profiles(second, axes, reach)
 
 
 def _profiles(run: RunMasses, axes: Array, reach_mm: float) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.epipolar import plane_angles, plane_axes, slices_along
+from gcar_deploy.geometry.epipolar import plane_angles, plane_axes, reach_mm, slices_along
 from gcar_deploy.types import Array, Image, Pixels, Scalars
 
 #: bins of a profile: width at the isocentre, and how many to each side of it
@@ -71,7 +71,7 @@ def mass_profiles(fixed: Mass, moving: Mass, carm: CArm, sigma_mm: float) -> tup
     -------
     two (2 HALF_BINS + 1,) arrays, each summing to 1; on average where both are calibrated
     """
-    reach = 0.5 * float(np.linalg.norm(fixed.carm.source_mm) + np.linalg.norm(carm.source_mm))
+    reach = reach_mm(fixed.carm, carm)
     axes = plane_axes(fixed.carm, carm)
     out, sums = [], []
     for mass, view in ((fixed, fixed.carm), (moving, carm)):
@@ -137,7 +137,7 @@ def match_rate(first: CArm, second: CArm, a: Pixels, b: Pixels, near_mm: float) 
     """
     if len(a) == 0 or len(b) == 0:
         return None
-    reach = 0.5 * float(np.linalg.norm(first.source_mm) + np.linalg.norm(second.source_mm))
+    reach = reach_mm(first, second)
     own = plane_angles(first, second, first, a) * reach
     other = np.sort(plane_angles(first, second, second, b) * reach)
     after = np.searchsorted(other, own).clip(0, len(other) - 1)

@@ -91,6 +91,11 @@ def plane_angles(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> Scala
     return plane_slices(first, second, carm, pixels)[0]
 
 
+def reach_mm(first: CArm, second: CArm) -> float:
+    """Mm at the isocentre for each radian between epipolar planes."""
+    return 0.5 * sum(float(np.linalg.norm(carm.source_mm)) for carm in (first, second))
+
+
 def plane_slices(first: CArm, second: CArm, carm: CArm, pixels: Pixels) -> tuple[Scalars, Scalars]:
     """Epipolar plane of each pixel of ``carm``, and what its path length counts for there.
 

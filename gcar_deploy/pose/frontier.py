@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.epipolar import plane_normal, plane_slices
+from gcar_deploy.geometry.epipolar import plane_normal, plane_slices, reach_mm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.joint import corrected
 from gcar_deploy.pose.motion import DIGITS, Modes, Motion, pixel_size_mm, thinned
@@ -121,7 +121,7 @@ def frontier_points(view: VesselImage, pair: tuple[CArm, CArm]) -> Frontier:
     found = []
     for side in (1.0, -1.0):
         across = np.full(shape, -1e3)
-        across[rows, cols] = side * _reach_mm(pair) * angle
+        across[rows, cols] = side * reach_mm(*pair) * angle
         top = cv2.dilate(across, np.ones((5, 5), np.uint8))
         kept: list[tuple[int, int]] = []
         for row, col in np.argwhere(inside & (across == top)).tolist():
@@ -266,8 +266,8 @@ class _Match:
 
         def gaps(told: CArm, moved: Pixels) -> Array:
             both = fixed, told
-            a = _reach_mm(pair) * plane_slices(*both, fixed, first.pixels)[0]
-            b = _reach_mm(pair) * plane_slices(*both, told, moved)[0]
+            a = reach_mm(*pair) * plane_slices(*both, fixed, first.pixels)[0]
+            b = reach_mm(*pair) * plane_slices(*both, told, moved)[0]
             return a[:, None] - b[None]
 
         here = gaps(carm, second.pixels)
@@ -332,11 +332,6 @@ class _Match:
 def _pose(x: Scalars, normal: Array) -> Array:
     """(5,) correction of a view from the unknowns."""
     return np.concatenate([x[0] * normal, x[1:POSE]])
-
-
-def _reach_mm(pair: tuple[CArm, CArm]) -> float:
-    """Mm at the isocentre for each radian between epipolar planes."""
-    return 0.5 * sum(float(np.linalg.norm(carm.source_mm)) for carm in pair)
 
 
 def _bell(x: Array, width: float) -> Array:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.epipolar import plane_angles
+from gcar_deploy.geometry.epipolar import plane_angles, reach_mm
 from gcar_deploy.quality.shown import CELLS_OFF, CELLS_ON, Shown
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
@@ -30,7 +30,8 @@ BIN_MM = 2.0
 #: and more between branches with a free end, 0.01 to 0.13 between parallel bars of one width
 MOST_DIFFERENCE = 0.15
 #: ... and of masks, whose widths differ by less than this share: halves of rings 0.02 to 0.04,
-#: stretches of 20 right trees 0.11 and more; of 160 generated ones none that was ok is below
+#: stretches of ten real left and ten right trees 0.11 and more; none of 80 generated pairs that
+#: were ok is below
 MOST_WIDTH_DIFFERENCE = 0.05
 #: mean share of a ray's evidence that lies in other places. Eight trees: 0.001 to 0.1
 MOST_ELSEWHERE = 0.12
@@ -59,8 +60,8 @@ def findings(alternatives: Sequence[Exchange], elsewhere: float | None) -> list[
     if alternatives:
         a, b = (end - start for start, end in alternatives[0].stretches_mm)
         first, second = (k + 1 for k in alternatives[0].branches)
-        whose = f"branches {first} and {second}"
-        whose = f"both of branch {first}" if first == second else whose
+        both = first == second
+        whose = f"both of branch {first}" if both else f"branches {first} and {second}"
         more = f" (and {len(alternatives) - 1} more pairs)" if len(alternatives) > 1 else ""
         out.append(
             f"two vessels of {a:.0f} and {b:.0f} mm ({whose}) could "
@@ -86,12 +87,13 @@ def exchanges(tree: Tree, carms: Sequence[CArm], *, masks: bool = False) -> tupl
     """
     if len(carms) != 2:
         return ()
-    ways = [way for number in range(len(tree.branches)) for way in _ways(tree, number, carms)]
+    numbers = range(len(tree.branches))
+    ways = [way for number in numbers for way in _ways(tree, number, carms, masks)]
     if len(ways) < 2:
         return ()
     low = min(way.at_mm.min() for way in ways) - 2 * BIN_MM
     high = max(way.at_mm.max() for way in ways) + 2 * BIN_MM
-    profiles = [_profile(way.at_mm, way.width if masks else way.mass, low, high) for way in ways]
+    profiles = [_profile(way.at_mm, way.shown, low, high) for way in ways]
     most = MOST_WIDTH_DIFFERENCE if masks else MOST_DIFFERENCE
     found = []
     for a, b in itertools.combinations(range(len(ways)), 2):
@@ -142,29 +144,27 @@ class _Way:
     ----------
     branch, stretch_mm : of the tree; from, to along it
     at_mm : (n,) epipolar plane of each segment, mm at the isocentre
-    mass : (n,) volume of each segment, mm^3
-    width : (n,) what a mask shows of it: radius times the planes it crosses, mm^2
+    shown : (n,) what the pictures show of each: its volume, mm^3, or, of masks, its radius times
+        the planes that it crosses, mm^2
     """
 
     branch: int
     stretch_mm: tuple[float, float]
     at_mm: Scalars
-    mass: Scalars
-    width: Scalars
+    shown: Scalars
 
 
-def _ways(tree: Tree, number: int, carms: Sequence[CArm]) -> list[_Way]:
+def _ways(tree: Tree, number: int, carms: Sequence[CArm], masks: bool) -> list[_Way]:
     """Cut a branch where it turns back; stretches of some length."""
     branch = tree.branches[number]
     arc = branch.arc_mm
     pixels, _ = carms[0].project(branch.points_mm)
-    reach = 0.5 * sum(float(np.linalg.norm(carm.source_mm)) for carm in carms)
-    at = plane_angles(carms[0], carms[1], carms[0], pixels) * reach
-    length, radius = np.diff(arc), 0.5 * (branch.radius_mm[1:] + branch.radius_mm[:-1])
-    mass, width = np.pi * radius**2 * length, radius * np.abs(np.diff(at))
+    at = plane_angles(carms[0], carms[1], carms[0], pixels) * reach_mm(carms[0], carms[1])
+    radius = 0.5 * (branch.radius_mm[1:] + branch.radius_mm[:-1])
+    shown = radius * np.abs(np.diff(at)) if masks else np.pi * radius**2 * np.diff(arc)
     middle = 0.5 * (at[1:] + at[:-1])
     return [
-        _Way(number, (float(arc[i]), float(arc[j])), middle[i:j], mass[i:j], width[i:j])
+        _Way(number, (float(arc[i]), float(arc[j])), middle[i:j], shown[i:j])
         for i, j in itertools.pairwise(turning_points(at, TURN_MM))
         if arc[j] - arc[i] >= MIN_LENGTH_MM
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import plane_angles
 from gcar_deploy.result import Result
-from gcar_deploy.tree.tree import Branch, polyline_arc
+from gcar_deploy.tree.tree import Branch
 from gcar_deploy.types import Points
 
 
@@ -30,18 +30,18 @@ def alternatives(result: Result) -> list[dict[str, Any]]:
 
 
 def exchange_marks(
-    first: Points, second: Points, carms: tuple[CArm, CArm]
+    first: Branch, second: Branch, carms: tuple[CArm, CArm]
 ) -> list[list[list[float]]]:
-    """Return marks that say: the first line of one view is the second line of the other.
+    """Return marks that say: the first branch of one view is the second branch of the other.
 
-    Each is a pair of places in one epipolar plane, (column, row), and both ways round. Lines are
-    (n, 3), mm LPS.
+    Each is a pair of places in one epipolar plane, (column, row), and both ways round.
     """
     out = []
     for one, other in ((first, second), (second, first)):
-        here, _ = carms[0].project(_middle(one)[None])
+        start = _middle(one)
+        here, _ = carms[0].project(start[None])
         plane = plane_angles(*carms, carms[0], here)
-        there, _ = carms[1].project(other)
+        there, _ = carms[1].project(other.points_mm)
         gaps = np.abs(plane_angles(*carms, carms[1], there) - plane)
         out.append([_rounded(here[0]), _rounded(there[int(gaps.argmin())])])
     return out
@@ -58,13 +58,10 @@ def _ghost(result: Result, told: dict[str, Any]) -> dict[str, Any]:
 
 def _exchange(result: Result, told: dict[str, Any]) -> dict[str, Any]:
     a, b = told["branches"]
-    first, second = (
-        _stretch(result.tree.branches[k - 1], *ends)
-        for k, ends in zip((a, b), told["stretches_mm"], strict=True)
-    )
-    marks = exchange_marks(first, second, (result.views[0].carm, result.views[1].carm))
-    whose = f"The two ways of branch {a}" if a == b else f"Branches {a} and {b}"
-    text = f"{whose} could change partners between the views without a trace"
+    branches = result.tree.branches
+    carms = (result.views[0].carm, result.views[1].carm)
+    marks = exchange_marks(branches[a - 1], branches[b - 1], carms)
+    text = f"Branches {a} and {b} could change partners between the views without a trace"
     return _entry(
         result, text, [a, b], told["middles_mm"][0], ("Exchange them", {"same_branch": marks})
     )
@@ -96,15 +93,8 @@ def _entry(
     }  # fmt: skip
 
 
-def _stretch(branch: Branch, start_mm: float, end_mm: float) -> Points:
-    on = (branch.arc_mm >= start_mm - 1e-6) & (branch.arc_mm <= end_mm + 1e-6)
-    part: Points = branch.points_mm[on]
-    return part
-
-
-def _middle(line: Points) -> Points:
-    arc = polyline_arc(line)
-    at: Points = line[int(np.argmin(np.abs(arc - 0.5 * arc[-1])))]
+def _middle(branch: Branch) -> Points:
+    at: Points = branch.points_mm[int(np.argmin(np.abs(branch.arc_mm - 0.5 * branch.length_mm)))]
     return at
 
 
