@@ -16,7 +16,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 744, 32, 300
 #: no more points a curve
 _POINTS = 120
 #: ... and no more than so many branches by their numbers
-_NAMED = 20
+_NAMED = 12
 
 
 def pressure_svg(drop: PressureDrop) -> str:

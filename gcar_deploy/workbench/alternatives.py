@@ -9,6 +9,7 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import plane_angles
 from gcar_deploy.result import Result
+from gcar_deploy.tree.edit import part_of
 from gcar_deploy.tree.tree import Branch
 from gcar_deploy.types import Points
 
@@ -58,10 +59,13 @@ def _ghost(result: Result, told: dict[str, Any]) -> dict[str, Any]:
 
 def _exchange(result: Result, told: dict[str, Any]) -> dict[str, Any]:
     a, b = told["branches"]
-    branches = result.tree.branches
-    carms = (result.views[0].carm, result.views[1].carm)
-    marks = exchange_marks(branches[a - 1], branches[b - 1], carms)
-    text = f"Branches {a} and {b} could change partners between the views without a trace"
+    first, second = (
+        _stretch(result.tree.branches[k - 1], *ends)
+        for k, ends in zip((a, b), told["stretches_mm"], strict=True)
+    )
+    marks = exchange_marks(first, second, (result.views[0].carm, result.views[1].carm))
+    whose = f"The two ways of branch {a}" if a == b else f"Branches {a} and {b}"
+    text = f"{whose} could change partners between the views without a trace"
     return _entry(
         result, text, [a, b], told["middles_mm"][0], ("Exchange them", {"same_branch": marks})
     )
@@ -91,6 +95,11 @@ def _entry(
         "at": [_rounded(view.carm.project(point)[0][0]) for view in result.views],
         "does": does, "add": add,
     }  # fmt: skip
+
+
+def _stretch(branch: Branch, start_mm: float, end_mm: float) -> Branch:
+    first, last = (int(np.argmin(np.abs(branch.arc_mm - at))) for at in (start_mm, end_mm))
+    return part_of(branch, first, last)
 
 
 def _middle(branch: Branch) -> Points:

@@ -35,7 +35,7 @@ def nearest_branch(result, place):
 def test_marks_of_an_exchange_lie_on_both_vessels_in_one_epipolar_plane(result):
     carms = tuple(view.carm for view in result.views)
     first, second = result.tree.branches[0], result.tree.branches[1]
-    marks = exchange_marks(first.points_mm, second.points_mm, carms)
+    marks = exchange_marks(first, second, carms)
     for mark, branches in zip(marks, ((first, second), (second, first)), strict=True):
         for carm, branch, point in zip(carms, branches, mark, strict=True):
             gaps = np.linalg.norm(carm.project(branch.points_mm)[0] - point, axis=1)
