@@ -119,21 +119,26 @@ def proposal(line: MissedLine, looks: Sequence[Look], tree: Tree, told: Told) ->
     others = [other for number, other in enumerate(looks) if number != line.view]
     cost, new = _costs(points, others, _paths(look, places, path), told)
     lookup = cKDTree(tree.points())
-    courses = []
+    courses, limit = [], MOST_COST * count * step
     for way in (slice(None), slice(None, None, -1)):
         # Whichever end leaves the tree comes first.
         gap, start = _nearest(points[way][0], lookup)
         away = _gap_costs(points[way][0], start, gap, looks, path)
-        depth, total = cheapest_course(step * cost[way], away, DEPTH_MM, step, TURN)
+        found = cheapest_course(step * cost[way], away, DEPTH_MM, step, TURN, limit)
+        if found is None:
+            continue
+        depth, total = found
         at = np.arange(count), depth
         first = start[depth[:1]] if gap[depth[0]] > ON_TREE_MM else np.empty((0, 3))
         course = np.concatenate([first, points[way][at]])
         courses.append((total, course, float(new[way][at].mean())))
-    total, course, shown = min(courses, key=lambda one: one[0])
-    per_mm = total / (count * step)
-    if per_mm > MOST_COST or shown < LEAST_NEW:
+        limit = total
+    if not courses:
         return None
-    return Proposal(per_mm, course, float(np.clip(0.5 * path, *RADIUS_BOUNDS_MM)))
+    total, course, shown = min(courses, key=lambda one: one[0])
+    if shown < LEAST_NEW:
+        return None
+    return Proposal(total / (count * step), course, float(np.clip(0.5 * path, *RADIUS_BOUNDS_MM)))
 
 
 def _depths(look: Look, places: Pixels, tree: Tree) -> Points:

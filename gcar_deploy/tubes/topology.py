@@ -20,6 +20,7 @@ from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
 from gcar_deploy.tubes.proposal import Told, proposal
 from gcar_deploy.tubes.run import Run, State, Trial
 from gcar_deploy.tubes.targets import Target
+from gcar_deploy.types import Points
 
 #: a vessel that was missed is kept where it lowers the objective by this share ...
 EARNED = 0.005
@@ -60,16 +61,25 @@ def _with_missed(
 ) -> Trial:
     """Add the lines that no tube explains, the likeliest first, each where it earns its place."""
     before: Trial | None = None
+    refused: list[Points] = []
     while before is not now and not run.progress.stopped:
         before = now
-        now = _with_some(now, views, targets, run, told)
+        now = _with_some(now, views, targets, run, told, refused)
     return now
 
 
 def _with_some(
-    now: Trial, views: Sequence[VesselImage], targets: list[Target], run: Run, told: Told
+    now: Trial,
+    views: Sequence[VesselImage],
+    targets: list[Target],
+    run: Run,
+    told: Told,
+    refused: list[Points],
 ) -> Trial:
-    """Ask each line that no tube explains once, the likeliest first."""
+    """Ask each line that no tube explains once, the likeliest first.
+
+    ``refused`` holds the courses of what the tree as it is gained nothing by.
+    """
     looks, lines = _lines(now.state, views, targets)
     found = ((number, proposal(line, looks, now.tree, told)) for number, line in enumerate(lines))
     # Equal costs in the order of the lines.
@@ -86,6 +96,8 @@ def _with_some(
                 heapq.heappush(asked, (again.cost, number, again, now))
                 continue
             one = again
+        if any(np.array_equal(one.points_mm, course) for course in refused):
+            continue
         trial = run.tried(one.added(now.tree), targets)
         if run.progress.stopped:
             break
@@ -95,6 +107,9 @@ def _with_some(
         if trial.loss < now.loss - price:
             now = trial
             looks = _looks(now.state, views, targets)
+            refused.clear()
+        else:
+            refused.append(one.points_mm)
     return now
 
 

@@ -44,3 +44,17 @@ def test_a_straight_corridor_is_followed_through_a_place_that_shows_nothing():
     depth, total = cheapest_course(cost, np.zeros(60), 0.5, 2.0, 0.15)
     np.testing.assert_array_equal(depth, corridor)
     assert total == pytest.approx(4.0 * np.hypot(1.0, 0.75))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_limit_leaves_out_what_costs_more_and_nothing_else(seed):
+    rng = np.random.default_rng(seed)
+    cost, start = rng.gamma(0.5, 2.0, (14, 40)), 20 * rng.random(40)
+    spaces = 0.5, 2.0, 0.15
+    depth, total = cheapest_course(cost, start, *spaces)
+    for share in (1.0, 1.01, 1.5):
+        same, again = cheapest_course(cost, start, *spaces, limit=share * total)
+        np.testing.assert_array_equal(same, depth)
+        assert again == total
+    assert cheapest_course(cost, start, *spaces, limit=0.999 * total) is None
+    assert cheapest_course(cost, start, *spaces, limit=0.0) is None
