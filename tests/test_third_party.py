@@ -24,6 +24,7 @@ def test_every_direct_dependency_is_listed_with_its_licence():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.req("REQ-47")
 def test_bill_of_materials_is_valid():
     pytest.importorskip("cyclonedx", reason="needs cyclonedx-python-lib")

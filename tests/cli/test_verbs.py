@@ -305,6 +305,7 @@ def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_full_disk_behind_stdout_is_one_line_and_the_result_stays(good_case, tmp_path):
     command = [sys.executable, "-m", "gcar_deploy.cli.main"]

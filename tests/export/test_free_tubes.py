@@ -27,6 +27,7 @@ def test_tubes_stay_within_their_bounds_and_are_drawn_again_alike():
         )
 
 
+@pytest.mark.slow
 def test_there_are_forks_rings_and_trees_apart():
     parts, rings, forks = [], 0, 0
     for seed in range(120):

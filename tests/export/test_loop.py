@@ -51,6 +51,7 @@ def line():
     return torch.nn.Linear(1, 1)
 
 
+@pytest.mark.slow
 def test_a_line_is_learned_and_its_mean_is_kept(tmp_path):
     net, losses = line(), []
     longer = options(steps=150, decay_steps=100)
@@ -80,6 +81,7 @@ def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
         np.testing.assert_array_equal(value, two[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_networks_that_learn_together_end_as_each_would_alone(tmp_path):
     """Also where an interruption left the first ahead of the second."""
 

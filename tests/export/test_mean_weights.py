@@ -31,6 +31,7 @@ def test_plain_at_first_and_exponential_then():
         MeanWeights(net, 0)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_gives_the_mean_and_goes_on_from_both(tmp_path):
     net, mean = one(3.0), one(1.0)
     optimiser = torch.optim.AdamW(net.parameters())

@@ -26,6 +26,7 @@ def test_shapes_have_the_lines_of_their_names():
         assert np.abs(every).max() < 62
 
 
+@pytest.mark.slow
 def test_every_shape_meets_every_c_arm():
     met = {(scene(3, k).name, scene(3, k).carms[0].rows) for k in range(len(SHAPES) * len(CARMS))}
     assert len(met) == len(SHAPES) * len(CARMS)

@@ -277,6 +277,7 @@ def test_crops_of_real_pictures_keep_picture_and_mask_together(drawn):
     assert seen >= 2
 
 
+@pytest.mark.slow
 def test_a_step_holds_real_and_generated_pictures(drawn, tmp_path):
     options = dataclasses.replace(TINY, batch=4, real=str(drawn), real_share=0.5, crop=128)
     stream = Stream(options, tmp_path, real_pictures(options.real, options.fold))
@@ -299,6 +300,7 @@ def test_a_pooled_picture_is_drawn_once_and_never_used_twice_alike(tmp_path):
     assert (pairs[0][0] != pairs[2][0]).any()
 
 
+@pytest.mark.slow
 def test_of_two_pooled_pictures_one_shows_a_tree_in_space(tmp_path):
     """Its chords are millimetres of a coronary artery in pixels, its vessels dark."""
     shown = [pooled(tmp_path, 5, k) for k in range(4)]
@@ -316,6 +318,7 @@ def test_of_two_pooled_pictures_one_shows_a_tree_in_space(tmp_path):
         assert 0.6 <= whole.zoom[0] < whole.zoom[1] <= 448 / 352
 
 
+@pytest.mark.slow
 def test_most_raw_pictures_show_one_artery_as_an_injection_does():
     """What a picture shows of the whole tree's volume, which hardly hangs on the view."""
     shares = []

@@ -45,6 +45,7 @@ def test_folds_leave_each_picture_out_once(drawn):
     assert left_out == [p.name for p in pictures]
 
 
+@pytest.mark.slow
 def test_what_is_no_fold(drawn):
     options = dataclasses.replace(TINY, real=str(drawn), fold=(2, 3))
     pictures = expert_pictures(drawn)

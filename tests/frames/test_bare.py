@@ -143,6 +143,7 @@ def test_pictures_and_early_frames_know_none(patient):
     assert [a.bare for a in angiograms] == [(), ()]
 
 
+@pytest.mark.slow
 def test_dicom_runs_know_them_in_run_and_in_enhance(tmp_path):
     cine = _run(6).cine
     pixels = np.stack([cine.decode(k) for k in range(len(cine))]).astype(np.uint8)

@@ -93,6 +93,7 @@ def test_pages_that_run_in_a_circle_end(tmp_path):
         open_cine(tmp_path / "circle.tif", OPTIONS)
 
 
+@pytest.mark.slow
 def test_auto_takes_a_pair_of_one_phase_from_folders(made, case):
     views = [case / "run1", case / "run2"]
     angiograms, _, notes = prepare(views, case / "geom.json", OPTIONS)

@@ -183,7 +183,7 @@ def poisoned(kind, rng):
 def test_poisoned_starts_stay_finite_and_bounded(kind):
     rng = np.random.default_rng(len(kind))
     views = views_of(random_gaussians(20, 5, spread=20, sigma=(1.5, 2.5)), 32)
-    options = dataclasses.replace(OPTIONS, steps=50, most_gaussians=400, patience=60)
+    options = dataclasses.replace(OPTIONS, steps=25, most_gaussians=400, patience=60)
     for _ in range(25):
         out = refine_paper(poisoned(kind, rng), views, options)
         g = out.gaussians

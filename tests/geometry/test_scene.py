@@ -323,6 +323,7 @@ VALUES = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.sampled_from(PATHS), st.one_of(VALUES, st.just(KeyError)))
 @pytest.mark.req("REQ-04")

@@ -231,7 +231,7 @@ def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
         "    write(path, data)\n"
         "    sys.stdout.write('writing\\n')\n"  # in one piece: several files are written at once
         "    sys.stdout.flush()\n"
-        "    time.sleep(3)\n"
+        "    time.sleep(1)\n"
         "folder._write = slow\n"
         f"main(['demo', '--predictor', 'none', '--refiner', 'none', '--out', {str(out)!r}])\n"
     )

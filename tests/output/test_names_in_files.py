@@ -29,6 +29,7 @@ def files(named):
     return render_files(named)
 
 
+@pytest.mark.slow
 def test_result_json(files):
     summary = json.loads(files["result.json"])
     jsonschema = pytest.importorskip("jsonschema")

@@ -263,6 +263,7 @@ def test_blank_pictures_leave_nothing_standing_and_nothing_breaks():
     assert refined.tree.length_mm < 0.2 * truth.length_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.req("REQ-22")
 def test_poisoned_starts_stay_finite_and_bounded(seed):
