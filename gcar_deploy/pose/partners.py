@@ -41,6 +41,9 @@ MOST_LINES = 8
 #: three and more views are fitted together, which takes a second: of what could change those ways
 #: are fitted, so many a round, with which the views agree best where they stand
 MOST_FITTED = 4
+#: two lines at once are asked of no more views: of eight with eight lines each that would be 1,792
+#: ways a round, each judged in all 28 pairs of views
+MOST_TWO_OF = 4
 Views: TypeAlias = "Sequence[VesselImage]"
 
 
@@ -78,7 +81,9 @@ def partnered(
             for view, few, may in zip(now, least, asked, strict=True)
         ]
         likely = [[one for one, device in some if device] for some in fewer]
-        tried = [(each, LIKELY_GAIN) for each in (*_one_of(now, likely), *_two_of(now, likely))]
+        tried = [(each, LIKELY_GAIN) for each in _one_of(now, likely)]
+        if len(now) <= MOST_TWO_OF:
+            tried += [(each, LIKELY_GAIN) for each in _two_of(now, likely)]
         if worst > enough:
             others = [[one for one, device in some if not device] for some in fewer]
             tried += [(each, GAIN) for each in _one_of(now, others)]
