@@ -213,8 +213,7 @@ def test_nothing_is_cut_off(opened, width):
 @pytest.mark.parametrize("width", [340, 390, 640, 680, 1280])
 def test_angles_and_names_do_not_run_into_each_other(opened, width):
     page = opened(width)
-    page.eval_on_selector("#legend", "e => e.textContent = 'LM: 1; LAD: 2, 3, 4, 12, 15; LCx: 7, 8, 20'")
+    names = "LM: 1; LAD: 2, 3, 4, 12, 15; LCx: 7, 8, 20"
+    page.eval_on_selector("#legend", "(e, names) => e.textContent = names", names)
     angle, legend = (page.locator(name).bounding_box() for name in ("#angle", "#legend"))
-    assert (
-        angle["y"] + angle["height"] <= legend["y"] or angle["x"] + angle["width"] <= legend["x"]
-    )
+    assert angle["y"] + angle["height"] <= legend["y"] or angle["x"] + angle["width"] <= legend["x"]
