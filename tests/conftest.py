@@ -43,6 +43,19 @@ def data_dir() -> Path:
     return Path(value)
 
 
+def of_data(*parts: str) -> Path:
+    """Return a folder of the optional data, wherever ``GCAR_DATA`` begins; skip without it."""
+    for root in (data_dir(), data_dir() / "data", data_dir().parent):
+        if root.joinpath(*parts).is_dir():
+            return root.joinpath(*parts)
+    pytest.skip("the optional data has no " + "/".join(parts))
+
+
+def ready_case(name: str) -> Path:
+    """Return the folder of a ready-made case."""
+    return of_data("cases", name)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Benchmarks measure time, which a busy machine makes meaningless: only when asked for."""
     parser.addoption("--run-benchmarks", action="store_true", help="run tests that measure time")

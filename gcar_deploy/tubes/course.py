@@ -13,9 +13,7 @@ from gcar_deploy.types import Array, Scalars
 MOST_SLOPE = 10
 #: by so many of them a slope may change from one place to the next
 MOST_CHANGE = 3
-
-
-#: bounds are sums in another order than the courses' own
+#: of a course's cost: bounds are its sums in another order
 ROUNDING = 1e-9
 
 

@@ -106,8 +106,8 @@ def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before,
     assert left[0] is views[0]
 
 
-@pytest.mark.parametrize(("count", "ways"), [(4, (8 + 24, 6 + 12)), (5, (10, 8))])
-def test_of_three_and_more_views_what_agrees_best_where_they_stand_is_fitted(count, ways):
+@pytest.mark.parametrize(("count", "ways", "best"), [(4, (8 + 24, 6 + 12), 8), (5, (10, 8), 6)])
+def test_of_three_and_more_views_what_agrees_best_where_they_stand_is_fitted(count, ways, best):
     """Views of a line that is likely a device, each with two ways to leave it out.
 
     One or two lines of four views go at once, one of five.
@@ -135,4 +135,5 @@ def test_of_three_and_more_views_what_agrees_best_where_they_stand_is_fitted(cou
     assert where(kept) == [3] and found[1].after == pytest.approx(0.5 * AGREED + 0.001)
     # The second round has a view less to ask.
     assert len(placed) == sum(ways) and len(fitted) == 2 * MOST_FITTED
-    assert all(3 in one for one in fitted[:2])
+    # Of five views just two ways of the first round are without the last one.
+    assert sum(3 in one for one in fitted) == best

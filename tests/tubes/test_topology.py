@@ -8,11 +8,14 @@ from scipy.spatial import cKDTree
 from skimage.morphology import skeletonize
 
 from gcar_deploy.config import TubeOptions
+from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import empty_tree
 from gcar_deploy.tubes.fit import fit_tubes
+from gcar_deploy.tubes.run import Run
 from gcar_deploy.tubes.topology import _hanging, loose_mm
+from tests.conftest import ready_case
 from tests.tree.shapes import fork, grid, points_of
 from tests.tubes.scenes import seen, two_views
 
@@ -82,3 +85,18 @@ def test_vessels_with_exchanged_partners_hang_on_the_tree_again(monkeypatch):
     left = fit_tubes(start, views, TubeOptions(), evidence=told).tree
     assert loose_mm(left) > 40.0
     assert cKDTree(truth.points()).query(left.points())[0].max() > 10.0
+
+
+def test_no_tree_is_fitted_on_trial_twice(monkeypatch):
+    """A line that is refused is proposed again by the next pass."""
+    folder, tried = ready_case("P_0001"), []
+    fit = Run.tried
+
+    def counted(run, tree, targets):
+        tried.append((tree.points().tobytes(), tree.radii().tobytes()))
+        return fit(run, tree, targets)
+
+    monkeypatch.setattr(Run, "tried", counted)
+    views = [folder / "view1.png", folder / "view2.png"]
+    Engine(threads=1).reconstruct(views, folder / "geom.json")
+    assert len(set(tried)) == len(tried) > 3

@@ -12,7 +12,7 @@ import pytest
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.worker.jobs import JobQueue
-from tests.conftest import PATIENCE_MS, data_dir
+from tests.conftest import PATIENCE_MS
 
 TOKEN = "a-token-of-the-tests"
 
@@ -78,19 +78,6 @@ def browse(chromium):
     for context in contexts:
         context.close()
     assert complaints == []
-
-
-def of_data(*parts: str) -> Path:
-    """Return a folder of the optional data, wherever ``GCAR_DATA`` begins; skip without it."""
-    for root in (data_dir(), data_dir() / "data", data_dir().parent):
-        if root.joinpath(*parts).is_dir():
-            return root.joinpath(*parts)
-    pytest.skip("the optional data has no " + "/".join(parts))
-
-
-def ready_case(name: str) -> Path:
-    """Return the folder of a ready-made case."""
-    return of_data("cases", name)
 
 
 def finished(page) -> str:

@@ -12,7 +12,8 @@ import pytest
 
 from gcar_deploy.engine import deliver
 from gcar_deploy.inputs.order import Order, load_order, parse_order
-from tests.workbench.conftest import finished, of_data, ready_case
+from tests.conftest import of_data, ready_case
+from tests.workbench.conftest import finished
 
 AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 #: what a run writes that holds no clock

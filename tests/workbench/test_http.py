@@ -12,7 +12,8 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.worker.jobs import JobQueue
 from tests.cli.conftest import good_case  # noqa: F401 - a fixture
-from tests.workbench.conftest import TOKEN, ready_case
+from tests.conftest import ready_case
+from tests.workbench.conftest import TOKEN
 
 pytest.importorskip("flask")
 pytest.importorskip("waitress")
