@@ -22,6 +22,7 @@ from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels
 from gcar_deploy.imaging.net import load_segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame
+from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
@@ -114,6 +115,7 @@ def inspect_files(
             landmark_pixels(marks, carms)
         frame = own_frame(carms, [a.sha256 for a in angiograms])
         own, asked = in_own_frame(frame, angiograms, options)
+        own = with_polarity(own)
         for k, angiogram in zip(frame.order, own, strict=True):
             view = extract_vessels(angiogram, options.imaging, segmenter)
             found.views[k]["vessel_share"] = float(view.mask.mean())

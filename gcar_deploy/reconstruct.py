@@ -7,10 +7,9 @@ the pictures -> tree, volume -> quality
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 
-from gcar_deploy.beside import side_by_side, started
+from gcar_deploy.beside import started
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.frame import own_frame
@@ -112,7 +111,7 @@ def _reconstructed(
 
     findings = check_views(angiograms, options.quality)
     with watch.stage("vessels") as report:
-        angiograms = side_by_side([functools.partial(with_polarity, a) for a in angiograms])
+        angiograms = with_polarity(angiograms)
         vessels = find_vessels(angiograms, options.imaging, segmenter, watch, report)
         keep(vessels)
     with watch.stage("pose"):

@@ -165,13 +165,14 @@ def _bright(stack: Array, carm: CArm, intensity: Intensity) -> tuple[Array, Mask
     # A frame without contrast tells nothing of how vessels look: the one that tells most is asked.
     some = stack[:: max(1, len(stack) // _ASKED)]
     mm = carm.pixel_at_isocenter_mm
-    told = max(some, key=lambda one: enhance.vessels_are_dark(one, mm)[1])
+    told = max(some, key=lambda one: abs(enhance.darkness(one, mm)))
     dark = is_dark(
         Angiogram(view_id="", carm=carm, pixels=told, bit_depth=8, intensity=intensity, sha256="")
     )
     if intensity.kind == "attenuation":
         return -stack if dark else stack.copy(), np.zeros(told.shape, bool)
-    holes = enhance.collimator(np.median(stack, axis=0).astype(np.float32))
+    middle = np.median(stack, axis=0).astype(np.float32)
+    holes = enhance.collimator(middle if dark else middle.max() - middle)
     # One white level for the whole run: what its display does to one frame it does to all.
     level = np.asarray(stack if dark else stack.max() - stack, dtype=np.float32)
     return enhance.absorbance(level), holes

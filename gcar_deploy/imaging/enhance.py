@@ -20,6 +20,15 @@ SCALE_POWER = -0.5
 FLATTEN_SIGMA_MM = 10.0
 #: of pixels up to this size at the isocentre polarity is told as well as of smaller ones, mm
 POLARITY_PIXEL_MM = 0.5
+#: of polarity, a ridge stands out that is so many times as strong as this percentile of all pixels
+#: in the sign that shows less; that share of it is added to what stands out in either
+STANDING_OUT, USUAL_PERCENT, LEAST_SHARE = 3.0, 90.0, 0.02
+#: a collimator shuts off no more of a picture than this
+MOST_SHUT = 0.6
+#: it is round where so many of its rim's places lie on one circle, to this share of the side
+ROUND_POINTS, ROUND_SHARE, CIRCLE_ROUNDS = 0.7, 0.01, 6
+#: ... and beyond it no more of the picture than this was not found
+ROUND_WEDGES = 0.12
 #: grey level, as a share of the white level, added before the logarithm
 LOG_OFFSET = 0.08
 #: ... and where paths are read from contrast: the window of a display takes the darkest grey value
@@ -69,7 +78,8 @@ def _collimator(pixels: Image) -> Mask:
     side = min(rows, columns)
     smooth = cv2.GaussianBlur(pixels, (0, 0), max(1.0, side / 150))
     middle, low = float(np.median(smooth)), float(np.percentile(smooth, 0.1))
-    dark = (smooth < low + 0.25 * (middle - low)).astype(np.uint8)
+    level = low + 0.25 * (middle - low)
+    dark = (smooth < level).astype(np.uint8)
     reach = round(side * 0.05) | 1
     # Continue the picture outwards, or the opening would eat the corners.
     padded = cv2.copyMakeBorder(dark, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
@@ -83,10 +93,40 @@ def _collimator(pixels: Image) -> Mask:
     for i in np.flatnonzero(chosen):
         chosen[i] = _step(smooth, label == i, reach) > 0.35 * (middle - low)
     found = chosen[label]
-    if found.mean() > 0.6:  # a dark picture, not a border
+    if found.mean() > MOST_SHUT:  # a dark picture, not a border
         return np.zeros_like(found)
     grow = max(3, round(side * 0.03)) | 1
-    return cv2.dilate(found.astype(np.uint8), np.ones((grow, grow), np.uint8)) > 0
+    grown = cv2.dilate(found.astype(np.uint8), np.ones((grow, grow), np.uint8)) > 0
+    circle = _circle(found)
+    if circle is None:
+        return grown
+    row, column = np.indices(found.shape, dtype=np.float32)
+    off = np.hypot(row - circle[0], column - circle[1]) - circle[2]
+    # Near the border a round shutter leaves wedges that are no wide areas; what lies beyond a dark
+    # corner is the picture.
+    if (~found & (off > 0)).mean() < ROUND_WEDGES:
+        grown |= off > -0.5 * grow
+    return grown
+
+
+def _circle(found: Mask) -> tuple[float, float, float] | None:
+    """Row and column of the middle and radius of a round shutter, None of any other."""
+    inside = cv2.erode(found.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    at = np.argwhere(found & ~inside).astype(np.float64)
+    tolerance = ROUND_SHARE * min(found.shape)
+    used, fit = np.ones(len(at), bool), np.zeros(3)
+    for _ in range(CIRCLE_ROUNDS):
+        if used.sum() < 32:
+            return None
+        # |x - m|^2 = r^2 is linear in m and in r^2 - |m|^2 (Kasa 1976).
+        terms = np.column_stack([2 * at, np.ones(len(at))])
+        fit = np.linalg.lstsq(terms[used], (at[used] ** 2).sum(axis=1), rcond=None)[0]
+        radius = float(np.sqrt(max(fit[2] + fit[0] ** 2 + fit[1] ** 2, 0.0)))
+        off = np.abs(np.hypot(*(at - fit[:2]).T) - radius)
+        used = off < max(tolerance, float(np.median(off)))
+    if (off < tolerance).mean() < ROUND_POINTS:
+        return None
+    return float(fit[0]), float(fit[1]), radius
 
 
 def _step(smooth: Array, area: Mask, reach: int) -> float:
@@ -231,21 +271,28 @@ def _coarser(pixels: Image, pixel_mm: float) -> tuple[Image, float]:
     return coarse.smaller(pixels, factor), factor * pixel_mm
 
 
-def vessels_are_dark(pixels: Image, pixel_mm: float) -> tuple[bool, float]:
+def darkness(pixels: Image, pixel_mm: float) -> float:
     """Compare the ridges of the picture with those of its negative.
+
+    What stands out of either counts, so that neither noise nor the share of the picture that is
+    vessel says much.
 
     Returns
     -------
-    dark : bool
-    margin : float
-        Ratio of the two strengths (99th percentile), >= 1; near 1 means undecided.
+    float
+        Log of the ratio of the two strengths: above 0 where dark lines are the stronger ones.
     """
     pixels, pixel_mm = _coarser(pixels, pixel_mm)
     holes = collimator(pixels)
+    # A negative has bright shutters, whose rim would be the strongest line of all.
+    shut = holes | collimator(pixels.max() - pixels)
+    if shut.mean() <= MOST_SHUT:
+        holes = shut
     flat = flatten(fill_holes(pixels, holes), FLATTEN_SIGMA_MM / pixel_mm)
-    strength = []
-    for picture in (-flat, flat):
-        response = ridges(picture, pixel_mm).response
-        strength.append(float(np.percentile(response[~holes], 99)) + 1e-12)
-    dark, bright = strength
-    return dark >= bright, max(dark, bright) / min(dark, bright)
+    found = [ridges(picture, pixel_mm).response[~holes] for picture in (-flat, flat)]
+    usual = min(float(np.percentile(response, USUAL_PERCENT)) for response in found)
+    dark, bright = (
+        float(np.maximum(response - STANDING_OUT * usual, 0).mean()) + LEAST_SHARE * usual + 1e-12
+        for response in found
+    )
+    return float(np.log(dark / bright))

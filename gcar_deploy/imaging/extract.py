@@ -77,7 +77,7 @@ def extract_vessels(
     GeometryError
         ``path_length`` without ``mm_per_count``; it or ``mask`` declared dark.
     """
-    angiogram = with_polarity(angiogram)
+    (angiogram,) = with_polarity([angiogram])
     found = _found(angiogram, options, segmenter)
     if angiogram.bare and asks_network([angiogram]):
         found = without_standing(found, *_frames(angiogram), ~found.valid)
@@ -405,9 +405,9 @@ def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Imag
     if kind == "attenuation":
         level = -level if dark else level
         return {"linear": level, "display": level}, np.zeros(pixels.shape, bool)
-    holes = enhance.collimator(pixels)
     if not dark:  # a negative: turn it back, so that Beer's law can be tried on it
         level = float(level.max()) - level
+    holes = enhance.collimator(pixels if dark else pixels.max() - pixels)
     floor = np.float32(0.5 / white)  # half a count: black stays finite
     return {
         "search": enhance.absorbance(level),

@@ -122,11 +122,40 @@ def test_a_picture_that_is_hardly_bright_is_what_is_usual_of_its_kind():
     level[150:153, 20:230] -= 7  # and a dark one that is a little weaker
     for kind, usual in (("raw", "dark"), ("attenuation", "bright")):
         given = angiogram(level.astype(np.float32), kind)
-        assert with_polarity(given).intensity.polarity == usual
-        assert with_polarity(with_polarity(given)).intensity.polarity == usual
+        (told,) = with_polarity([given])
+        assert told.intensity.polarity == usual
+        assert with_polarity([told])[0].intensity.polarity == usual
     for kind in ("path_length", "mask"):
         given = angiogram(level.astype(np.float32), kind, mm_per_count=1.0)
-        assert with_polarity(given) is given
+        assert with_polarity([given])[0] is given
+
+
+def test_a_doubtful_picture_is_read_like_the_clear_one_beside_it():
+    """Both came through one display; what is sure by itself stays, declared or seen."""
+    clear = raw_picture(tube_paths(), gain=0.02)
+    rng = np.random.default_rng(5)
+    doubtful = np.clip(128 + 30 * rng.standard_normal(clear.shape), 0, 255).astype(np.float32)
+    sure = raw_picture(tube_paths(), gain=0.2, noise=0.5)
+
+    def read(*pictures, **declared):
+        told = with_polarity([angiogram(one, **declared) for one in pictures])
+        return [one.intensity.polarity for one in told]
+
+    assert read(doubtful, clear) == read(clear, doubtful) == ["dark", "dark"]
+    assert read(doubtful, 255 - clear) == ["bright", "bright"]
+    assert read(sure, 255 - sure) == ["dark", "bright"]
+    assert read(doubtful, 255 - clear, polarity="dark") == ["dark", "dark"]
+
+
+def test_a_negative_with_a_shutter_gives_the_same_vessels():
+    picture = raw_picture(tube_paths(), gain=0.04)
+    row, column = np.indices(picture.shape) - 127.5
+    picture[np.hypot(row, column) > 128] = 4
+    dark, turned = (
+        extract_vessels(angiogram(one), _OPTIONS).mask for one in (picture, 255 - picture)
+    )
+    assert _dice(dark, tube_paths() > 0.5) > 0.8
+    assert _dice(dark, turned) > 0.95
 
 
 def test_sixteen_bit_equals_eight_bit_within_quantisation():
