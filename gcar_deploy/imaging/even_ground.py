@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.segment import PART_SHARE
 from gcar_deploy.types import Array, Image, Mask
 
@@ -40,6 +41,8 @@ _BLURS_PX = (0.0, 1.0, 2.0)
 #: so near to what stands out, pixels, the ground of a line stands out by less than this share of
 #: the line itself; speckles on a cloud's top have the cloud beside them
 _BESIDE_PX, _BESIDE_SHARE = 4, 0.4
+#: what reaches the border in places so far apart, as a share of the shorter side, runs across
+_ACROSS, _TOUCHING_PX = 0.7, 4
 #: middles are averaged over so much of the line, pixels
 _ALONG_PX = 3.0
 
@@ -81,9 +84,10 @@ def shadow(picture: Image, holes: Mask) -> Shadow | None:
             spread = 1.4826 * float(np.median(np.abs(few)))
             if deepest > 0 and spread <= _SPREAD * deepest:
                 floor = max(_DEVIATIONS * spread, _LEAST * deepest)
-                if _blocks_off(np.where(seen, rise[::step, ::step], np.nan), floor):
+                shown = np.where(seen, rise[::step, ::step], np.nan)
+                if _blocks_off(shown, floor) or _blocks_rough(shown, floor):
                     return None
-                found = _of_rise(np.asarray(rise, np.float32), floor, deepest)
+                found = _of_rise(np.asarray(rise, np.float32), holes, (floor, deepest))
                 return found and Shadow(*found, shaded=bool(shaded))
     return None
 
@@ -108,16 +112,33 @@ def _grounds(picture: Image, holes: Mask) -> Iterator[Array | float]:
     yield rows @ surface.reshape(_DEGREE + 1, _DEGREE + 1) @ columns.T
 
 
-def _blocks_off(rise: Array, floor: float) -> bool:
-    """Whether the ground of some blocks lies higher or lower than that of the picture."""
-    grounds = [
-        np.percentile(inside, 100 - _BLOCK_VESSEL)
+def _blocks(rise: Array) -> list[Array]:
+    """Split a picture into blocks, of each what is shown there; of those at least half shown."""
+    return [
+        inside
         for band in np.array_split(rise, _BLOCKS)
         for block in np.array_split(band, _BLOCKS, axis=1)
         if (inside := block[np.isfinite(block)]).size > block.size // 2
     ]
+
+
+def _blocks_off(rise: Array, floor: float) -> bool:
+    """Whether the ground of some blocks lies higher or lower than that of the picture."""
+    grounds = [np.percentile(inside, 100 - _BLOCK_VESSEL) for inside in _blocks(rise)]
     off = np.abs(np.asarray(grounds) - np.median(grounds)) if grounds else np.zeros(0)
     return int((off > _OFF_SHARE * floor).sum()) > _BLOCKS_OFF
+
+
+def _blocks_rough(rise: Array, floor: float) -> bool:
+    """Whether the grain of some block would pass for vessel: it stands out the other way as well.
+
+    Of the same light a logarithm makes more noise where the picture is dark.
+    """
+    for inside in _blocks(rise):
+        middle = float(np.median(inside))
+        if middle < floor and float((inside < middle - floor).mean()) > _OTHER_WAY:
+            return True
+    return False
 
 
 def _on_ground(line: Mask, reach: Mask, rise: Image) -> Mask:
@@ -136,8 +157,24 @@ def _on_ground(line: Mask, reach: Mask, rise: Image) -> Mask:
     return out
 
 
-def _of_rise(rise: Image, floor: float, deepest: float) -> tuple[Mask, bool] | None:
-    """Mask of what stands out by ``floor``, and whether it is flat; None where it is no lines."""
+def _across(mask: Mask, holes: Mask) -> bool:
+    """Whether something runs across the whole picture, as ribs and wires do beside vessels."""
+    border = inward_px(~holes) <= _TOUCHING_PX
+    _, part = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    farthest = _ACROSS * min(mask.shape)
+    for k in np.unique(part[border & mask]):
+        ends = np.argwhere((part == k) & border)
+        if np.hypot(*np.ptp(ends, axis=0)) > farthest:
+            return True
+    return False
+
+
+def _of_rise(rise: Image, holes: Mask, levels: tuple[float, float]) -> tuple[Mask, bool] | None:
+    """Mask of what stands out by a floor, and whether it is flat; None where it is no lines.
+
+    ``levels`` are the floor and the deepest vessels.
+    """
+    floor, deepest = levels
     if float((rise < -floor).mean()) > _OTHER_WAY:
         return None
     reach = rise > floor
@@ -148,6 +185,8 @@ def _of_rise(rise: Image, floor: float, deepest: float) -> tuple[Mask, bool] | N
         return None
     kept = skel.strong_parts(_on_ground(line, reach, rise), rise, PART_SHARE)
     if not kept.any():
+        return None
+    if _across(reach & skel.beside(reach, line, kept), holes):
         return None
     _, (peak,) = skel.spread(line, (rise,), _ALONG_PX)
     mask = ((rise > RIM_SHARE * peak) | kept) & skel.beside(reach, line, kept)

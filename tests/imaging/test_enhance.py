@@ -139,6 +139,38 @@ def test_straight_wire_goes_and_a_bent_vessel_stays():
     assert left[:, 165:].sum() < 20  # of 200
 
 
+def test_grain_that_is_strong_in_one_part_is_no_vessel_and_a_line_beside_it_stays():
+    """Answers of a filter: four times as strong on the left as on the right, where a line runs."""
+    noise = np.random.default_rng(4).standard_normal((240, 480)).astype(np.float32)
+    answers = cv2.GaussianBlur(noise**2, (0, 0), 1.5)
+    answers[:, :240] *= 4
+    arc = np.zeros(answers.shape, np.uint8)
+    cv2.ellipse(arc, (360, 120), (90, 80), 0, 0, 230, 1, 3)
+    answers[arc > 0] = 12.0
+    valid = np.ones(answers.shape, bool)
+    grain = segment._grain(answers, valid, 0.5)
+    assert np.median(grain[:, :200]) == pytest.approx(4 * np.median(grain[:, 280:]), rel=0.05)
+    line = segment.centreline(answers, valid, 0.5)
+    assert line[:, :240].sum() < 0.05 * line.sum()
+    assert (line & (arc > 0)).sum() > 300 and (line & (arc == 0)).sum() < 20
+
+
+def test_fine_pixels_show_a_given_mask_as_well_as_coarse_ones():
+    """What is asked is how well the vessel stands out, not how well each of its pixels does."""
+    path = tube_paths(256)
+    fine = cv2.resize(path, (768, 768), interpolation=cv2.INTER_LINEAR)
+    rng = np.random.default_rng(2)
+    contrast = []
+    for picture, share, pixel_mm in ((path, 1, 0.5), (fine, 3, 0.5 / 3)):
+        # As many quanta: a ninth of them for each of nine pixels.
+        noisy = picture + rng.normal(0, 0.3 * share, picture.shape)
+        holes = np.zeros(picture.shape, bool)
+        contrast.append(
+            segment.given(noisy.astype(np.float32), picture > 0, holes, pixel_mm).contrast
+        )
+    assert contrast[1] == pytest.approx(contrast[0], rel=0.15)
+
+
 def _noisy_tube(blur_px: float) -> np.ndarray:
     noise = np.random.default_rng(6).standard_normal((256, 256))
     noise = cv2.GaussianBlur(noise, (0, 0), blur_px) if blur_px else noise

@@ -76,6 +76,37 @@ def test_letters_are_no_vessel() -> None:
     assert dice(found.mask, mask) > 0.99
 
 
+@pytest.mark.parametrize("radius", [190, 400])
+def test_what_runs_across_the_whole_picture_is_no_vessel_of_it(radius: int) -> None:
+    """Ribs, wires: the ground is that of a body, whatever lies beside them."""
+    picture, _ = drawn(True)
+    row, col = np.indices(picture.shape)
+    holes = np.hypot(row - 199.5, col - 199.5) > radius
+    band = np.exp(-(((row - 200 - 0.2 * col) / 8) ** 2)).astype(np.float32)
+    assert shadow(picture + 0.4 * band, holes) is None
+
+
+def test_grain_that_is_coarser_in_dark_parts_is_no_vessel() -> None:
+    """A logarithm makes of even noise on a dark cloud many times what it makes beside it."""
+    picture, mask = drawn(True)
+    row, col = np.indices(picture.shape)
+    cloud = np.hypot(row - 80, col - 310) < 45
+    grain = np.random.default_rng(8).normal(0, 1, picture.shape)
+    assert shadow((picture + 0.01 * grain).astype(np.float32), NO_HOLES) is not None
+    rough = picture + np.where(cloud, 0.06, 0.01) * grain
+    assert not (cloud & mask).any()
+    assert shadow(rough.astype(np.float32), NO_HOLES) is None
+
+
+def test_what_comes_in_from_one_side_is_drawn_with_the_vessels() -> None:
+    picture, mask = drawn(True)
+    row, col = np.indices(picture.shape)
+    come = np.exp(-(((row - 200 - 0.2 * col) / 8) ** 2)) * (col < 150)
+    found = shadow((picture + 0.4 * come).astype(np.float32), NO_HOLES)
+    assert found is not None
+    assert (found.mask & mask).sum() > 0.95 * mask.sum()
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.06])
 def test_light_may_fall_off_and_grain_may_be_coarse(noise: float) -> None:
     picture, mask = drawn(True)
