@@ -15,6 +15,10 @@ from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.pose.significance import asked
 from gcar_deploy.quality import check_asked, check_consistency, check_motion, check_poses, with_hint
 
+#: places where vessels turn and end contradict each other from here on (root mean square), mm. Of
+#: generated pictures of two patients with this rule: 0.48 to 0.83; of one patient: 0.3
+LEAST_CONTRADICTION_MM = 0.4
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Registered:
@@ -144,7 +148,7 @@ def _two_contradictions(poses: Sequence[Pose]) -> str:
     Of pictures of two patients outlines may agree by chance, but hardly where vessels turn and end.
     """
     moved = max(pose.motion_mm for pose in poses)
-    if moved == 0:
+    if moved < LEAST_CONTRADICTION_MM:
         return ""
     return (
         "the views contradict each other: in the contrasts of their vessels, and by "

@@ -7,7 +7,7 @@ import pytest
 
 from gcar_deploy.config import PoseOptions, RunOptions
 from gcar_deploy.errors import RefusedError
-from gcar_deploy.pose import profile_fit, register
+from gcar_deploy.pose import profile_fit, register, registration
 from tests.pose.test_agreement import pair
 
 OPTIONS = RunOptions()
@@ -46,13 +46,17 @@ def test_two_trees_are_refused_when_asked_with_what_was_measured():
 
 
 @pytest.mark.slow
-def test_outlines_of_two_trees_that_agree_by_chance_are_refused_by_where_vessels_end():
+def test_outlines_of_two_trees_that_agree_by_chance_are_refused_by_where_vessels_end(monkeypatch):
     angiograms, views = pair(seeds=(4, 9), stranger=True)
     placed = register(angiograms, views, OPTIONS, never)
     assert {view.kind for view in placed.views} == {"mask"} and placed.poses[1].motion_mm > 0
     assert placed.disagreement < OPTIONS.quality.good_disagreement_mask
     with pytest.raises(RefusedError, match=r"contrasts.*turn and end; different patients"):
         placed.or_refuse()
+    moved = placed.poses[1].motion_mm
+    for least, refused in ((0.99 * moved, True), (1.01 * moved, False)):
+        monkeypatch.setattr(registration, "LEAST_CONTRADICTION_MM", least)
+        assert bool(register(angiograms, views, OPTIONS, never).refusal) is refused
     one = pair()[1]
     across = np.exp(2.0 * np.linspace(-1, 1, 192))[None]
     spoilt = [
