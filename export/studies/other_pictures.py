@@ -35,6 +35,23 @@ def _left(path: Array, per_mm: float = 0.3) -> Array:
     return np.exp(-per_mm * path)
 
 
+def _shuttered(grey: Array, v: Array, u: Array) -> Array:
+    """Leave a round field that touches the border."""
+    return np.where(np.hypot(u - 0.5, v - 0.5) < 0.5, grey, 5.0)
+
+
+def _ribs(v: Array, u: Array) -> Array:
+    """Absorbance of three ribs that run across the picture, their width a 24th of it."""
+    places = (0.2 + 0.2 * u, 0.75 - 0.25 * u, 0.9 - 0.3 * u * u)
+    out: Array = np.sum([0.15 * np.exp(-(((v - one) / 0.025) ** 2)) for one in places], axis=0)
+    return out
+
+
+def _cloud(v: Array, u: Array) -> Array:
+    """Absorbance of a dark cloud near a corner."""
+    return 2.2 * np.exp(-((u - 0.72) ** 2 + (v - 0.25) ** 2) / (2 * 0.13**2))
+
+
 #: grey values 0 .. 255 from path in mm, row and column as shares of the side, and a source of noise
 LOOKS: dict[str, Look] = {
     "dark on white": lambda path, v, u, rng: 250 * _left(path),
@@ -48,6 +65,18 @@ LOOKS: dict[str, Look] = {
     ),
     "coarse grain": lambda path, v, u, rng: 200 * _left(path) + rng.normal(0, 8, path.shape),
     "black vessels": lambda path, v, u, rng: 400 * _left(path, 0.6) - 60,
+    "round shutter": lambda path, v, u, rng: _shuttered(
+        (150 + 80 * u) * _left(path) + rng.normal(0, 3, path.shape), v, u
+    ),
+    "negative, round shutter": lambda path, v, u, rng: (
+        255 - _shuttered((150 + 80 * u) * _left(path) + rng.normal(0, 3, path.shape), v, u)
+    ),
+    "ribs": lambda path, v, u, rng: (
+        220 * np.exp(-_ribs(v, u)) * _left(path) + rng.normal(0, 2, path.shape)
+    ),
+    "noise on a dark cloud": lambda path, v, u, rng: (
+        230 * np.exp(-_cloud(v, u)) * _left(path) + rng.normal(0, 4, path.shape)
+    ),
 }
 
 
