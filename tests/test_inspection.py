@@ -1,7 +1,10 @@
 """gcar validate: what is said before any reconstruction, and the exit code that run would give."""
 
+import contextlib
 import dataclasses
 import json
+import logging
+import re
 
 import cv2
 import numpy as np
@@ -9,9 +12,9 @@ import pytest
 from click.testing import CliRunner
 
 from gcar_deploy.cli.main import gcar
-from gcar_deploy.config import PredictOptions, RefineOptions, RunOptions
+from gcar_deploy.config import ImagingOptions, PredictOptions, RefineOptions, RunOptions
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import RefusedError
+from gcar_deploy.errors import GcarError, RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
@@ -47,6 +50,29 @@ def test_a_good_case(case):
     assert 80 < out["pairs"][0]["separation_deg"] < 90
     assert out["pairs"][0]["disagreement"] < 0.05
     assert any("unseen in the pictures" in text for text in out["silent_errors"])
+
+
+def test_polarity_is_judged_of_all_pictures_together(case, caplog):
+    """By run and validate alike: the views name one factor for all, which is none of their own."""
+    scene = json.loads((case / "geom.json").read_text())
+    rng = np.random.default_rng(3)
+    for k, (view, noise) in enumerate(zip(scene["views"], (1.0, 25.0), strict=True), start=1):
+        path = cv2.imread(str(case / f"view{k}.png"), -1) * view["intensity"]["mm_per_count"]
+        grey = 180 * np.exp(-0.15 * path) + rng.normal(0, noise, path.shape)
+        cv2.imwrite(str(case / f"view{k}.png"), np.clip(grey, 0, 255).astype(np.uint8))
+        view["intensity"] = {"kind": "raw"}
+    (case / "geom.json").write_text(json.dumps(scene))
+    options = RunOptions(imaging=ImagingOptions(segmenter="classic"))
+    for ask in (
+        lambda: inspect_files(*files(case), options=options),
+        lambda: Engine(threads=1, options=options).reconstruct(*files(case)),
+    ):
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="gcar_deploy"), contextlib.suppress(GcarError):
+            ask()
+        said = re.findall(r"factor ([\d.]+), ([\d.]+) together", caplog.text)
+        assert len(said) == 2 and len({together for _, together in said}) == 1
+        assert all(own != together for own, together in said)
 
 
 def test_nothing_is_written(case):

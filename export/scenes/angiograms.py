@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.imaging import enhance
+from gcar_deploy.imaging.collimator import collimator
 from gcar_deploy.imaging.net import net_input
 from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.types import Array, Image, Mask
@@ -130,7 +131,7 @@ def network_input(pixels: Array) -> tuple[Array, Mask]:
     Made by the code that makes it at run time, collimator search included.
     """
     counts = pixels.astype(np.float32)
-    holes = enhance.collimator(counts)
+    holes = collimator(counts)
     white = max(float(np.percentile(counts, 99.5)), 1e-12)
     return net_input(enhance.absorbance(counts / np.float32(white)), holes), holes
 

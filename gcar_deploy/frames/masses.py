@@ -21,6 +21,7 @@ from gcar_deploy.geometry.epipolar import plane_axes, reach_mm, slices_along
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.collimator import collimator
 from gcar_deploy.imaging.extract import above_half
 from gcar_deploy.imaging.polarity import is_dark
 from gcar_deploy.types import Array, Image, Mask
@@ -171,8 +172,7 @@ def _bright(stack: Array, carm: CArm, intensity: Intensity) -> tuple[Array, Mask
     )
     if intensity.kind == "attenuation":
         return -stack if dark else stack.copy(), np.zeros(told.shape, bool)
-    middle = np.median(stack, axis=0).astype(np.float32)
-    holes = enhance.collimator(middle if dark else middle.max() - middle)
+    holes = collimator(np.median(stack, axis=0).astype(np.float32), negative=not dark)
     # One white level for the whole run: what its display does to one frame it does to all.
     level = np.asarray(stack if dark else stack.max() - stack, dtype=np.float32)
     return enhance.absorbance(level), holes

@@ -14,6 +14,7 @@ import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.border import inward_px
+from gcar_deploy.imaging.resample import blocks
 from gcar_deploy.imaging.segment import PART_SHARE
 from gcar_deploy.types import Array, Image, Mask
 
@@ -112,19 +113,18 @@ def _grounds(picture: Image, holes: Mask) -> Iterator[Array | float]:
     yield rows @ surface.reshape(_DEGREE + 1, _DEGREE + 1) @ columns.T
 
 
-def _blocks(rise: Array) -> list[Array]:
+def _shown_blocks(rise: Array) -> list[Array]:
     """Split a picture into blocks, of each what is shown there; of those at least half shown."""
     return [
         inside
-        for band in np.array_split(rise, _BLOCKS)
-        for block in np.array_split(band, _BLOCKS, axis=1)
+        for block in blocks(rise, _BLOCKS, _BLOCKS)
         if (inside := block[np.isfinite(block)]).size > block.size // 2
     ]
 
 
 def _blocks_off(rise: Array, floor: float) -> bool:
     """Whether the ground of some blocks lies higher or lower than that of the picture."""
-    grounds = [np.percentile(inside, 100 - _BLOCK_VESSEL) for inside in _blocks(rise)]
+    grounds = [np.percentile(inside, 100 - _BLOCK_VESSEL) for inside in _shown_blocks(rise)]
     off = np.abs(np.asarray(grounds) - np.median(grounds)) if grounds else np.zeros(0)
     return int((off > _OFF_SHARE * floor).sum()) > _BLOCKS_OFF
 
@@ -134,7 +134,7 @@ def _blocks_rough(rise: Array, floor: float) -> bool:
 
     Of the same light a logarithm makes more noise where the picture is dark.
     """
-    for inside in _blocks(rise):
+    for inside in _shown_blocks(rise):
         middle = float(np.median(inside))
         if middle < floor and float((inside < middle - floor).mean()) > _OTHER_WAY:
             return True

@@ -16,6 +16,7 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.border import cut_out, put_back, shown_box
 from gcar_deploy.imaging.coarse import as_fine, coarser
+from gcar_deploy.imaging.collimator import collimator
 from gcar_deploy.imaging.edits import edited
 from gcar_deploy.imaging.fusion import fused, without_device
 from gcar_deploy.imaging.learned import Found, learned_vessels
@@ -407,7 +408,7 @@ def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Imag
         return {"linear": level, "display": level}, np.zeros(pixels.shape, bool)
     if not dark:  # a negative: turn it back, so that Beer's law can be tried on it
         level = float(level.max()) - level
-    holes = enhance.collimator(pixels if dark else pixels.max() - pixels)
+    holes = collimator(pixels, negative=not dark)
     floor = np.float32(0.5 / white)  # half a count: black stays finite
     return {
         "search": enhance.absorbance(level),

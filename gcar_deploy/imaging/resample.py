@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -65,6 +65,12 @@ def resize(picture: Image, size: tuple[int, ...]) -> Image:
     interpolation = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
     size = (size[0], size[1])
     return np.asarray(cv2.resize(picture, size, interpolation=interpolation), dtype=np.float32)
+
+
+def blocks(picture: Array, down: int, across: int) -> Iterator[Array]:
+    """Cut a picture into about equal blocks, so many down and across, row by row."""
+    for band in np.array_split(picture, down):
+        yield from np.array_split(band, across, axis=1)
 
 
 def area_average(picture: Image, rows: int, columns: int) -> Image:

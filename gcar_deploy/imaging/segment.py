@@ -10,7 +10,7 @@ import numpy as np
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
-from gcar_deploy.imaging.resample import resize
+from gcar_deploy.imaging.resample import blocks, resize
 from gcar_deploy.types import Array, Image, Mask
 
 #: vessels are looked for at this pixel size (coarser pictures keep their own)
@@ -131,11 +131,17 @@ def segment(
 
 def at_working_size(picture: Image, holes: Mask, pixel_mm: float) -> tuple[Image, Mask, float]:
     """Return picture, holes and pixel size for the search; coarser pictures keep their own."""
+    size = _working_size(picture, pixel_mm)
+    work = resize(enhance.fill_holes(picture, holes), size)
+    work_holes = resize(holes.astype(np.float32), size) > 0.1
+    return work, work_holes, pixel_mm * picture.shape[1] / size[0]
+
+
+def _working_size(picture: Image, pixel_mm: float) -> tuple[int, int]:
+    """Columns and rows of the search."""
     rows, columns = picture.shape
     scale = min(1.0, pixel_mm / WORK_PIXEL_MM)
-    size = (max(16, round(columns * scale)), max(16, round(rows * scale)))
-    work = resize(enhance.fill_holes(picture, holes), size)
-    return work, resize(holes.astype(np.float32), size) > 0.1, pixel_mm * columns / size[0]
+    return max(16, round(columns * scale)), max(16, round(rows * scale))
 
 
 def centreline(response: Image, valid: Mask, pixel_mm: float) -> Mask:
@@ -166,12 +172,11 @@ def _grain(response: Image, valid: Mask, pixel_mm: float) -> Image:
     side = GRAIN_BLOCK_MM / pixel_mm
     rows, columns = (max(1, round(n / side)) for n in response.shape)
     answers = np.where(valid & (response > 0), response, np.nan)
-    grain = np.zeros((rows, columns), np.float32)
-    for i, band in enumerate(np.array_split(answers, rows)):
-        for j, block in enumerate(np.array_split(band, columns, axis=1)):
-            some = block[np.isfinite(block)]
-            grain[i, j] = np.median(some) if len(some) else 0.0
-    return resize(grain, response.shape[::-1])
+    found = [
+        np.median(some) if len(some := block[np.isfinite(block)]) else 0.0
+        for block in blocks(answers, rows, columns)
+    ]
+    return resize(np.array(found, np.float32).reshape(rows, columns), response.shape[::-1])
 
 
 def given(picture: Image, mask: Mask, holes: Mask, pixel_mm: float) -> Segmentation:
@@ -188,8 +193,7 @@ def given(picture: Image, mask: Mask, holes: Mask, pixel_mm: float) -> Segmentat
     rise = filled - enhance.background(filled, mask, pixel_mm)
     peak = float(rise[line].mean()) if line.any() else 0.0
     # Fine pixels have more noise, and show a vessel no worse.
-    scale = min(1.0, pixel_mm / WORK_PIXEL_MM)
-    size = (max(16, round(picture.shape[1] * scale)), max(16, round(picture.shape[0] * scale)))
+    size = _working_size(picture, pixel_mm)
     coarse = cv2.GaussianBlur(resize(rise, size), (0, 0), NOISE_BLUR_PX)
     noise = _noise_beside(coarse, resize(mask.astype(np.float32), size) > 0)
     return Segmentation(
