@@ -203,6 +203,19 @@ def test_unfit_arrays(case, engine, array, words):
         engine.reconstruct([angiograms[0].pixels, array], scene)
 
 
+def test_path_lengths_with_noise_about_zero_are_taken(case, engine):
+    angiograms, _, scene = case
+    scale = scene.views[0].intensity.mm_per_count
+    rng = np.random.default_rng(2)
+    clean = [np.asarray(a.pixels, np.float32) for a in angiograms]
+    noisy = [p + rng.normal(0, 0.02 / scale, p.shape).astype(np.float32) for p in clean]
+    assert min(p.min() for p in noisy) < 0
+    found = engine.reconstruct(noisy, scene)
+    same = engine.reconstruct([np.maximum(p, 0) for p in noisy], scene)
+    np.testing.assert_array_equal(found.volume, same.volume)
+    assert found.volume.max() > 0.5
+
+
 def test_wrong_calls(case, engine, tmp_path):
     angiograms, grid, scene = case
     with pytest.raises(UsageError, match="two or more"):

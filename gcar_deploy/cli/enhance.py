@@ -116,6 +116,9 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
     valid, pixel_mm, chosen = None, meaning.pixel_mm, None
     notes: list[str] = []
     options = order.options(RunOptions())
+    intensity = Intensity(
+        kind=meaning.kind, polarity=meaning.polarity, mm_per_count=meaning.mm_per_count
+    )
     if is_dicom(picture):
         dicom = options.dicom
         run = read_run(picture, dicom, wanted_frames(dicom, 1)[0])
@@ -128,10 +131,7 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
             except GeometryError as error:
                 notes.append(f"its pixel size is not known: {error}")
     else:
-        pixels = read_picture(picture, ImagingOptions().limits)
-    intensity = Intensity(
-        kind=meaning.kind, polarity=meaning.polarity, mm_per_count=meaning.mm_per_count
-    )
+        pixels = read_picture(picture, ImagingOptions().limits, differs=intensity.differs)
     angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
     if pixel_mm is None:
         notes.append(

@@ -77,6 +77,11 @@ class Intensity:
         if self.kind == "path_length" and scale is None:
             raise GeometryError("intensity.mm_per_count is missing: kind path_length needs it")
 
+    @property
+    def differs(self) -> bool:
+        """Whether the picture is what vessels add to another, whose noise lies about 0."""
+        return self.kind in ("path_length", "attenuation")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:

@@ -20,7 +20,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half
-from gcar_deploy.imaging.read import read_picture
+from gcar_deploy.imaging.read import from_zero, read_picture
 from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.runs import find_runs, seen_runs, together, with_bare
 
@@ -208,9 +208,9 @@ def _angiogram(
 ) -> Angiogram:
     """Read a picture file, or take an array; what was rescaled is added to ``notes``."""
     if isinstance(picture, np.ndarray):
-        read = _from_array(view.id, picture, options.limits)
+        read = _from_array(view, picture, options.limits)
     else:
-        read = read_picture(picture, options.limits)
+        read = read_picture(picture, options.limits, differs=view.intensity.differs)
     return _as_angiogram(read, view, options, notes, picture)
 
 
@@ -266,9 +266,10 @@ def _matched(
 
 
 def _from_array(
-    view_id: str, array: np.ndarray, limits: PictureLimits
+    view: View, array: np.ndarray, limits: PictureLimits
 ) -> tuple[np.ndarray, int, str]:
     """Like ``read_picture`` for counts that are in memory already."""
+    view_id = view.id
     depth = _DEPTHS.get(array.dtype.name)
     if depth is None or array.ndim != 2:
         raise ImageError(
@@ -280,10 +281,11 @@ def _from_array(
             f"view {view_id}: {array.shape[0]} x {array.shape[1]} pixels; each side must be "
             f"{limits.min_side} .. {limits.max_side}"
         )
+    given, array = array, from_zero(array) if view.intensity.differs else array
     if not (np.isfinite(array).all() and array.min() >= 0):
         raise ImageError(f"view {view_id}: grey values must be finite and not negative")
-    sha256 = hashlib.sha256(f"{array.dtype.name}{array.shape}".encode())
-    sha256.update(np.ascontiguousarray(array).tobytes())
+    sha256 = hashlib.sha256(f"{given.dtype.name}{given.shape}".encode())
+    sha256.update(np.ascontiguousarray(given).tobytes())
     # Columns first in memory is the same picture: what follows looks at rows.
     return array.astype(np.float32, order="C"), depth, sha256.hexdigest()
 

@@ -224,3 +224,21 @@ def test_flipped_bytes_give_a_picture_or_an_image_error(tmp_path, data):
         assert "\n" not in str(error)
     else:
         assert np.isfinite(pixels).all()
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tiff"])
+def test_noise_about_zero_is_no_fault_of_a_difference(tmp_path, suffix):
+    """A subtracted picture is as often below 0 as above it where there is no vessel."""
+    picture = np.random.default_rng(5).normal(0, 0.1, (32, 48)).astype(np.float32)
+    picture[10:14] += 2
+    path = tmp_path / f"view{suffix}"
+    path.write_bytes(_npy(picture) if suffix == ".npy" else _encoded(suffix, picture))
+    with pytest.raises(ImageError, match="negative"):
+        read_picture(path)
+    pixels, depth, _ = read_picture(path, differs=True)
+    np.testing.assert_array_equal(pixels, np.maximum(picture, 0))
+    assert depth == 32
+    # As far below as above is no noise: vessels are dark in it, say.
+    path.write_bytes(_npy(-picture) if suffix == ".npy" else _encoded(suffix, -picture))
+    with pytest.raises(ImageError, match="negative"):
+        read_picture(path, differs=True)
