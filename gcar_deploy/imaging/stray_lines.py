@@ -24,6 +24,9 @@ from gcar_deploy.types import Mask
 
 #: so near to the border of the field a line comes from outside, mm
 BORDER_MM = 4.0
+#: what goes on from a device over this much of its way, and is so many times as wide, is the vessel
+#: that it fills
+_FILLED_MM, WIDER = (3.0, 15.0), 1.3
 #: side branches shorter than this are spurs; lines shorter than this move nothing; longest, mm
 SPUR_MM, SHORTEST_MM, LONGEST_MM = 6.0, 8.0, 160.0
 #: a line goes on through a fork where it turns by no more than this over so much of its way
@@ -45,7 +48,10 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
     yield from (label == k for k in range(1, count)
                 if k != size.argmax() and size[k] >= SHORTEST_MM * px)  # fmt: skip
     graph = LineGraph(line)
-    for end in graph.ends(line & _from_outside(view, px)):
+    near = inward_px(view.valid) <= BORDER_MM * px
+    for end in graph.ends(line & (near | _beside_device(view, px))):
+        if not near[end] and _fills(view, graph, end, px):
+            continue
         path, spurs = graph.walk(end, SPUR_MM * px, LONGEST_MM * px)
         if len(path) >= SHORTEST_MM * px:
             yield _drawn(line, [*path, *spurs])
@@ -54,13 +60,27 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
             yield _drawn(line, further)
 
 
-def _from_outside(view: VesselImage, px: float) -> Mask:
-    """Where a line may come from outside: near the border, or near a device that was left out."""
-    near = inward_px(view.valid) <= BORDER_MM * px
+def _beside_device(view: VesselImage, px: float) -> Mask:
+    """Where a line may go on from a device that was left out."""
     if view.catheter is None or not view.catheter.any():
-        return near
+        return np.zeros_like(view.mask)
     beside = cv2.distanceTransform((~view.catheter).astype(np.uint8), cv2.DIST_L2, 5)
-    return near | (beside <= BORDER_MM * px)
+    near: Mask = beside <= BORDER_MM * px
+    return near
+
+
+def _fills(view: VesselImage, graph: LineGraph, end: Pixel, px: float) -> bool:
+    """Whether the line from ``end`` is wider than the device before it: a catheter's ostium."""
+    first, last = (round(mm * px) for mm in _FILLED_MM)
+    path, _ = graph.walk(end, SPUR_MM * px, last)
+    whole = view if view.kept is None else view.kept()
+    before = np.argwhere(_lost(view, whole))
+    before = before[np.hypot(*(before - end).T) <= last]
+    if len(path) < first or not len(before):
+        return False
+    half = cv2.distanceTransform(whole.mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    own = float(np.median(half[tuple(np.transpose(path[first:]))])) if len(path) > first else 0.0
+    return own >= WIDER * float(np.median(half[tuple(before.T)]))
 
 
 def likely_devices(view: VesselImage, level: float) -> Iterator[Mask]:
@@ -95,6 +115,12 @@ def lost_lines(view: VesselImage, whole: VesselImage) -> Iterator[Mask]:
     size = np.bincount(label[line], minlength=count)
     least = SHORTEST_MM / view.carm.pixel_at_isocenter_mm
     yield from (label == k for k in range(1, count) if size[k] >= least)
+
+
+def comes_from_outside(view: VesselImage, line: Mask) -> bool:
+    """Whether a line reaches the border of the field."""
+    near = inward_px(view.valid) * view.carm.pixel_at_isocenter_mm <= BORDER_MM
+    return bool((line & near).any())
 
 
 def with_line(view: VesselImage, whole: VesselImage, lost: Mask) -> VesselImage:

@@ -16,6 +16,7 @@ from typing import TypeAlias
 
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.stray_lines import (
+    comes_from_outside,
     likely_devices,
     lost_lines,
     stray_lines,
@@ -25,7 +26,7 @@ from gcar_deploy.imaging.stray_lines import (
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.types import Mask
 
-#: each line that is left out lowers the disagreement to this share at least
+#: what is changed of what the pictures show lowers the disagreement to this share at least
 GAIN = 0.85
 #: what was taken for a device comes back where it does so much, though the views agree already. Of
 #: 119 lines of devices in generated cath-lab pairs (seeds 7900 and 9100) none lowers it to less
@@ -87,9 +88,9 @@ def partnered(
         if worst > enough:
             others = [[one for one, device in some if not device] for some in fewer]
             tried += [(each, GAIN) for each in _one_of(now, others)]
-        more = [more_of(view) if may else () for view, may in zip(now, asked, strict=True)]
         gain = GAIN if worst > enough else BACK_GAIN
-        tried += [(each, gain) for each in _one_of(now, more)]
+        lost = [more_of(view) if may else () for view, may in zip(now, asked, strict=True)]
+        tried += [(each, gain) for each in _one_of(now, _back(lost))]
         if not tried:
             break
         if len(now) > 2:
@@ -135,12 +136,27 @@ def _fewer(view: VesselImage, least_px: float) -> list[tuple[VesselImage, bool]]
     return found
 
 
-def _more(view: VesselImage) -> list[VesselImage]:
-    """Return the view with one of the lines that were taken for a device, for each."""
+def _more(view: VesselImage) -> list[tuple[VesselImage, bool]]:
+    """Return the view with a line that was taken for a device, for each, and if from outside."""
     if view.kept is None:
         return []
     whole = view.kept()
-    return [with_line(view, whole, line) for line in _longest(lost_lines(view, whole))]
+    return [
+        (with_line(view, whole, line), comes_from_outside(view, line))
+        for line in _longest(lost_lines(view, whole))
+    ]
+
+
+def _back(lost: Sequence[Sequence[tuple[VesselImage, bool]]]) -> list[list[VesselImage]]:
+    """Return for each view what it may be with a line that was taken for a device.
+
+    What comes from outside in two views is a catheter, which both show.
+    """
+    outside = [any(comes for _, comes in some) for some in lost]
+    return [
+        [one for one, comes in some if not (comes and any(outside[:k] + outside[k + 1 :]))]
+        for k, some in enumerate(lost)
+    ]
 
 
 def _longest(lines: Iterable[Mask]) -> list[Mask]:

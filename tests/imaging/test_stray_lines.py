@@ -9,7 +9,13 @@ import pytest
 
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.skeleton import skeletonize
-from gcar_deploy.imaging.stray_lines import lost_lines, stray_lines, with_line, without_line
+from gcar_deploy.imaging.stray_lines import (
+    comes_from_outside,
+    lost_lines,
+    stray_lines,
+    with_line,
+    without_line,
+)
 from gcar_deploy.types import Mask
 from tests.imaging.phantoms import PIXEL_MM, carm
 
@@ -84,6 +90,27 @@ def test_what_goes_on_from_a_device_that_was_left_out_is_asked() -> None:
     assert list(stray_lines(dataclasses.replace(view, catheter=elsewhere))) == []
     line = next(stray_lines(dataclasses.replace(view, catheter=beyond)))
     assert covers(line, BRANCH) > 0.9 and not line[:100].any()
+
+
+@pytest.mark.parametrize(("half", "asked"), [(2, True), (5, False)])
+def test_what_is_wider_than_the_device_before_it_is_the_vessel_that_it_fills(
+    half: int, asked: bool
+) -> None:
+    """A catheter from the right, 5 pixels wide, and on from its tip a line as wide, or wider."""
+    tip = SIDE - 40
+    catheter = BRANCH[0], slice(tip, SIDE)
+    vessel = slice(BRANCH[0].start + 2 - half, BRANCH[0].start + 3 + half), slice(MIDDLE, tip)
+    whole = view_of(VESSEL, vessel, catheter)
+    view, device = view_of(VESSEL, vessel), np.zeros((SIDE, SIDE), bool)
+    device[catheter] = True
+    view = dataclasses.replace(view, catheter=device, kept=lambda: whole)
+    assert bool(list(stray_lines(view))) is asked
+
+
+def test_a_line_from_outside_is_one_that_reaches_the_border() -> None:
+    view = view_of(VESSEL, CROSSING)
+    assert comes_from_outside(view, view_of(CROSSING).skeleton)
+    assert not comes_from_outside(view, view_of(BRANCH).skeleton)
 
 
 def test_a_line_that_comes_back_leaves_nothing_of_its_device() -> None:

@@ -106,6 +106,21 @@ def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before,
     assert left[0] is views[0]
 
 
+@pytest.mark.parametrize("both", [False, True])
+def test_what_comes_from_outside_in_two_views_is_a_catheter(both):
+    """One view would agree far better with its line back; the other has lost such a line, too."""
+    whole = crossed(0.0)
+    lost = without_line(view_of(VESSEL, CROSSING), view_of(CROSSING).skeleton)
+    lost = dataclasses.replace(lost, kept=lambda: whole)
+    views = [lost, dataclasses.replace(lost) if both else whole]
+
+    def estimate(tried):
+        return poses(0.5 * AGREED if there(tried[0]) else AGREED)
+
+    kept, _ = partnered(views, estimate(views), (True, True), ENOUGH, estimate, never)
+    assert there(kept[0]) is not both
+
+
 @pytest.mark.parametrize(("count", "ways", "best"), [(4, (8 + 24, 6 + 12), 8), (5, (10, 8), 6)])
 def test_of_three_and_more_views_what_agrees_best_where_they_stand_is_fitted(count, ways, best):
     """Views of a line that is likely a device, each with two ways to leave it out.
