@@ -47,6 +47,8 @@ _ALONG_PX, _BLUR_PX = 3.0, 0.7
 #: a line of one picture alone is left out where it is so probably no vessel, as long as no more
 #: than this share of all lines goes
 DEVICE_LEVEL, DEVICE_SHARE = 0.95, 0.8
+#: where its line is so many times as wide as in its middle, a device touches a vessel
+WIDER = 1.5
 #: what is vessel, and how deep
 Found: TypeAlias = tuple[segment.Segmentation, Image]
 
@@ -139,9 +141,14 @@ def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -
     pixel_mm = NOMINAL_MM / finer
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / pixel_mm)
     sigma_px = enhance.ridges(flat, pixel_mm).sigma_px
-    found = skel.beside_alone(reach, line, catheters(line, flat, sigma_px, ~holes, pixel_mm))
-    for part in device_parts(line, told, DEVICE_LEVEL, finer):
-        more = found | skel.beside_alone(reach, line, part)
+    half = cv2.distanceTransform(reach.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    found = np.zeros_like(reach)
+    course = catheters(line, flat, sigma_px, ~holes, pixel_mm)
+    for part in (course, *device_parts(line, told, DEVICE_LEVEL, finer)):
+        if not part.any():
+            continue
+        even = part & (half <= WIDER * float(np.median(half[part])))
+        more = found | skel.beside_alone(reach, line, even)
         # A picture of devices alone is for others to refuse.
         if (more & line).sum() <= DEVICE_SHARE * line.sum():
             found = more
@@ -175,7 +182,7 @@ def support(seen: Seen, levels: tuple[float, float]) -> Mask:
     line = skel.prune(line, deep, SPUR_PX, TWIG_SHARE * top)
     if line.any():
         line = skel.strong_parts(line, deep, segment.PART_SHARE)
-    return skel.beside(reach, whole, line)
+    return skel.beside(reach, whole, line) | skel.inscribed(reach, line)
 
 
 def _with_contrast(near: Mask, chord: Image, contrast: Image, finer: float) -> Mask:

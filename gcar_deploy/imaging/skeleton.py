@@ -188,6 +188,18 @@ def beside(reach: Mask, skeleton: Mask, kept: Mask) -> Mask:
     return reach & nearest(near, skeleton)
 
 
+def inscribed(reach: Mask, line: Mask) -> Mask:
+    """Pixels within the circles that touch the rim of ``reach`` and have their middle on a line.
+
+    A vessel seen end-on is a disc at the end of its line: nothing of it is a branch.
+    """
+    half = cv2.distanceTransform(reach.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    out = np.zeros(reach.shape, np.uint8)
+    for row, col in np.argwhere(line & reach).tolist():
+        cv2.circle(out, (col, row), int(half[row, col]), 1, -1)
+    return reach & (out > 0)
+
+
 def beside_alone(reach: Mask, skeleton: Mask, part: Mask) -> Mask:
     """Pixels of ``reach`` that are ``beside`` a part of the skeleton and not beside the rest."""
     if not part.any():

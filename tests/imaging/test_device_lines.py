@@ -11,6 +11,7 @@ import pytest
 from gcar_deploy.errors import ImageError
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.device_lines import device_map, device_parts
+from gcar_deploy.imaging.learned import devices
 from gcar_deploy.imaging.net import SIDE, Seen
 from gcar_deploy.imaging.stray_lines import likely_devices, without_line
 from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, covers, view_of
@@ -135,3 +136,20 @@ def test_the_word_goes_with_the_view():
     assert left.mask[VESSEL].mean() > 0.95
     with pytest.raises(ImageError, match="has"):
         dataclasses.replace(view, device=device[1:])
+
+
+def test_a_blob_at_the_tip_of_a_catheter_is_a_vessel_seen_end_on():
+    """The network calls all of the line a device, up to the middle of the blob."""
+    reach = np.zeros((SIDE, SIDE), bool)
+    reach[200:205, :200] = True
+    row, col = np.indices(reach.shape)
+    blob = np.hypot(row - 202, col - 200) <= 12
+    reach |= blob
+    reach[202:340, 198:203] = True  # and the vessel goes on
+    line = skel.skeletonize(reach)
+    told = np.zeros(reach.shape, np.float32)
+    told[199:206, :200] = 0.99
+    nothing = np.zeros_like(reach)
+    found = devices(told, reach, line, reach.astype(np.float32), nothing)
+    assert found[200:205, 5:170].all()
+    assert not found[np.hypot(row - 202, col - 200) <= 8].any() and not found[230:].any()

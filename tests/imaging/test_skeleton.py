@@ -123,3 +123,18 @@ def test_the_order_in_memory_changes_nothing():
     line = skel.skeletonize(mask)
     assert line.sum() < 60
     np.testing.assert_array_equal(skel.skeletonize(np.asfortranarray(mask)), line)
+
+
+def test_circles_on_a_line_hold_the_disc_at_its_end_and_no_branch():
+    """A vessel seen end-on, and a twig beside it."""
+    row, col = np.indices((80, 120))
+    disc = np.hypot(row - 40, col - 30) <= 12
+    vessel = (np.abs(row - 40) <= 5) & (col >= 30) & (col < 110)
+    twig = (np.abs(col - 80) <= 1) & (row >= 40) & (row < 70)
+    line = np.zeros(disc.shape, bool)
+    line[40, 30:106] = True
+    found = skel.inscribed(disc | vessel | twig, line)
+    assert found[disc & (np.hypot(row - 40, col - 30) <= 11)].all()
+    assert found[vessel & (col < 104)].mean() > 0.97
+    assert not found[twig & (row > 48)].any()
+    assert not skel.inscribed(disc, np.zeros_like(disc)).any()
