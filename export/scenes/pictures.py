@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
-from gcar_deploy.imaging.extract import CONTRAST_ERROR, MASK_ERROR
+from gcar_deploy.imaging.extract import CONTRAST_ERROR
 from gcar_deploy.imaging.mask_path import mask_path
+from gcar_deploy.imaging.widths import MASK_ERROR
 from gcar_deploy.types import Array, Image, Mask
 
 #: kinds of input with the relative error of their paths, as the runtime gives it

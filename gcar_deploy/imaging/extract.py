@@ -25,6 +25,7 @@ from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.imaging.polarity import is_dark, with_polarity
 from gcar_deploy.imaging.standing import what_came, without_standing
+from gcar_deploy.imaging.widths import MASK_ERROR
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)
@@ -32,9 +33,6 @@ _log = logging.getLogger(__name__)
 _Grey: TypeAlias = tuple[dict[str, Image], Mask]
 #: relative error of a path that was judged from contrast, and by the network
 CONTRAST_ERROR, CHORD_ERROR = 0.25, 0.15
-#: ... and from the width of a mask: its edges are off by a part of a pixel, a vessel seen at a
-#: slant is thicker than it is wide, and overlaps show one of two vessels
-MASK_ERROR = 0.3
 #: path-length pictures: vessel where the ray's mean path exceeds this share of a pixel's edge p.
 #: A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns in the sampling
 #: of the picture itself
@@ -246,18 +244,6 @@ def _from_drawn(angiogram: Angiogram, mask: Mask, least_mm: float = MIN_LENGTH_M
         skeleton=line,
         valid=np.ones(mask.shape, bool) if angiogram.valid is None else angiogram.valid,
         kind="mask",
-    )
-
-
-def by_width(view: VesselImage) -> VesselImage:
-    """Return the view with the chords of its mask for paths: its contrast is not believed."""
-    return dataclasses.replace(
-        view,
-        path_mm=mask_path(view.mask, view.carm.pixel_at_isocenter_mm),
-        path_error=MASK_ERROR,
-        kind="mask",
-        others=(),
-        kept=None,
     )
 
 

@@ -12,13 +12,13 @@ import numpy as np
 from gcar_deploy.config import PoseOptions, RunOptions
 from gcar_deploy.geometry.consistency import Mass, disagreement, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import by_width
 from gcar_deploy.imaging.resample import sampled_path
+from gcar_deploy.imaging.widths import by_width, own_widths, with_widths
 from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
-from gcar_deploy.pose.partners import partnered
+from gcar_deploy.pose.partners import GAIN, partnered
 from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
@@ -37,12 +37,12 @@ def agreeing(
 ) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]]:
     """Estimate poses; where raw pictures disagree, from less of each if that agrees better.
 
-    First from what one method sees of all views, where the other followed lines that have no
-    counterpart; then without lines that no other view shows, and with those that were taken for
-    devices and that another view shows (``partners``). Where they contradict
-    each other still, the same from any reading of either view, and then from widths alone. Nothing
-    of a mask that the user gave is left out. ``check`` is called before each estimate, and may
-    raise.
+    First with a word of the widths about path lengths, if that agrees far better; then from what
+    one method sees of all views, where the other followed lines that have no counterpart; then
+    without lines that no other view shows, and with those that were taken for devices and that
+    another view shows (``partners``). Where they contradict each other still, the same from any
+    reading of either view, and then from widths alone. Nothing of a mask that the user gave is left
+    out. ``check`` is called before each estimate, and may raise.
 
     Returns
     -------
@@ -65,8 +65,9 @@ def agreeing(
     def judge(tried: Sequence[VesselImage], placed: Sequence[Pose]) -> tuple[Pose, ...]:
         return poses_between(tried, options, placed)
 
-    seen: Sequence[VesselImage] = views
     first = poses = estimate(views)
+    views, poses = _with_widths(views, asked, poses, estimate)
+    seen, first = views, poses
     for readings in (_by_method, _likeliest):
         tried = seen
         seen, poses = _closest(tried, poses, readings(views, first, options), options)
@@ -79,6 +80,25 @@ def agreeing(
             return fewer, closer, _changed(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.
     return _by_width(views, asked, options) or (list(seen), poses, [])
+
+
+def _with_widths(
+    views: Sequence[VesselImage], asked: Sequence[bool], poses: tuple[Pose, ...],
+    estimate: Callable[[Sequence[VesselImage]], tuple[Pose, ...]],
+) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:  # fmt: skip
+    """Let widths have a word about the paths of raw pictures where the views agree far better so.
+
+    Where contrasts are clean, widths make paths worse.
+    """
+    own = [own_widths(view) if may else view for view, may in zip(views, asked, strict=True)]
+    if all(one is view for one, view in zip(own, views, strict=True)):
+        return views, poses
+    closer = estimate(own)
+    if max(p.after for p in closer) >= GAIN * max(p.after for p in poses):
+        return views, poses
+    _log.info("the views agree far better where widths have a word about path lengths")
+    whole = [with_widths(view) if may else view for view, may in zip(views, asked, strict=True)]
+    return whole, closer
 
 
 def _changed(now: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[str]:

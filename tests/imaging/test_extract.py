@@ -9,12 +9,12 @@ from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import GeometryError, ImageError, RefusedError
 from gcar_deploy.imaging.extract import (
     CONTRAST_ERROR,
-    MASK_ERROR,
     asks_network,
     extract_vessels,
 )
 from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.resample import area_average, coarsened, resize, resized
+from gcar_deploy.imaging.widths import MASK_ERROR
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
 

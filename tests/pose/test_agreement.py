@@ -1,6 +1,7 @@
 """Background taken for vessel in one raw picture does not make two views contradict each other."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.resample import resized
 from gcar_deploy.imaging.skeleton import skeletonize
+from gcar_deploy.pose import agreement
 from gcar_deploy.pose.agreement import agreeing, order_of, other_order, poses_between
+from gcar_deploy.pose.partners import GAIN
 
 render = pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
 from gcar_export.scenes.trees import random_tree  # noqa: E402
@@ -264,3 +267,22 @@ def test_who_wants_out_gets_out_between_two_estimates():
     with pytest.raises(CancelledError):
         agreeing(angiograms, views, OPTIONS, check)
     assert len(asked) == 2
+
+
+@pytest.mark.parametrize(("share", "taken"), [(GAIN - 0.01, True), (GAIN + 0.01, False)])
+def test_widths_have_a_word_where_the_views_agree_far_better_so(share, taken):
+    """What the network drew, and how well the views are said to agree with other paths."""
+    views = pair()[1]
+    drawn = [dataclasses.replace(view, by_network=True) for view in views]
+
+    def estimate(tried):
+        same = all((a.path_mm == b.path_mm).all() for a, b in zip(tried, drawn, strict=True))
+        after = 0.1 * (1.0 if same else share)
+        return tuple(SimpleNamespace(after=after) for _ in tried)
+
+    found, poses = agreement._with_widths(drawn, (True, True), estimate(drawn), estimate)
+    assert all((one is view) is not taken for one, view in zip(found, drawn, strict=True))
+    assert poses[1].after == pytest.approx(0.1 * (share if taken else 1.0))
+    # The filter's view has no widths to believe in, and a mask of the user's none to doubt.
+    assert agreement._with_widths(views, (True, True), estimate(views), estimate)[0] is views
+    assert agreement._with_widths(drawn, (False, False), estimate(drawn), estimate)[0] is drawn
