@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.imaging.polarity import is_dark, with_polarity
+from gcar_deploy.imaging.shadow_devices import without_devices
 from gcar_deploy.imaging.standing import what_came, without_standing
 from gcar_deploy.imaging.widths import MASK_ERROR
 from gcar_deploy.types import Image, Mask
@@ -104,7 +106,8 @@ def _found(
         grey = _grey_values(part)
         drawn = even_ground.shadow(grey[0]["linear"], grey[1])
         if drawn is not None:
-            return put_back(_from_shadow(part, grey, drawn), angiogram, box)
+            view = _from_shadow(part, grey, drawn, options, segmenter)
+            return put_back(view, angiogram, box)
     small = coarser(part)
     grey = grey if small is part else _grey_values(small)
     # Beside anatomy, widths and chords tell the laws apart too badly to choose one.
@@ -155,8 +158,11 @@ def _from_both(angiogram: Angiogram, grey: _Grey, segmenter: Segmenter) -> Vesse
         return learned
 
 
-def _from_shadow(angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow) -> VesselImage:
-    """Vessels on an even ground, without what the ridge filter takes for a catheter."""
+def _from_shadow(
+    angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow, options: ImagingOptions,
+    segmenter: Segmenter | None,
+) -> VesselImage:  # fmt: skip
+    """Vessels on an even ground, without what filter and network take for a catheter."""
     seen = dataclasses.replace(angiogram, mask=drawn.mask)
     shaded = drawn.shaded and "log" in grey[0]  # half of the light is half of the contrast
     grey = _under(grey, *(("log",) if shaded else ("linear", "log")))
@@ -164,11 +170,13 @@ def _from_shadow(angiogram: Angiogram, grey: _Grey, drawn: even_ground.Shadow) -
         view = _from_drawn(seen, drawn.mask, EVEN_LENGTH_MM)
     else:
         view = _from_grey(seen, grey, None, EVEN_LENGTH_MM)
-    try:
+    with contextlib.suppress(RefusedError):
         filtered, *_ = _lines(angiogram, grey, None)
-    except RefusedError:
+        view = without_device(view, filtered.catheter, filtered.catheter_mm)
+    if drawn.flat or segmenter is None or options.segmenter == "classic":
         return view
-    return without_device(view, filtered.catheter, filtered.catheter_mm)
+    search = grey[0].get("search", next(iter(grey[0].values())))
+    return without_devices(view, search, grey[1], segmenter)
 
 
 def _needed(segmenter: Segmenter | None) -> Segmenter:
