@@ -23,6 +23,7 @@ from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.geometry.scene import Scene, View, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.frame import ChosenFrame
+from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.vessels import Vessels
 from gcar_deploy.inputs.order import Order, order_to_json, parse_order
@@ -71,6 +72,7 @@ class Case:
         self.proposed: dict[int, ChosenFrame] = {}
         self._frame: OwnFrame | None = None
         self._read: tuple[str, tuple[tuple[Angiogram, ...], list[str]]] | None = None
+        self._judged: tuple[tuple[Angiogram, ...], tuple[Angiogram, ...]] | None = None
         self._lock = threading.Lock()
         self.order = dataclasses.replace(order, out=Path(RESULT_NAME), force=True)
         self._keep()
@@ -118,6 +120,19 @@ class Case:
             They cannot be read or do not go together.
         """
         return self._prepared()[0]
+
+    def judged(self) -> tuple[Angiogram, ...]:
+        """Pictures with their polarity as a run takes it: judged of all together.
+
+        Raises
+        ------
+        GcarError
+            As ``angiograms``.
+        """
+        found, known = self.angiograms(), self._judged
+        if known is None or known[0] is not found:
+            self._judged = known = found, tuple(with_polarity(found))
+        return known[1]
 
     def described(self) -> dict[str, Any]:
         """Return all that the page shows before a run, as JSON values; a problem is a sentence."""

@@ -160,7 +160,7 @@ def _pictures(app: Flask, desk: Desk) -> None:
 
     @app.get("/api/cases/<case_id>/views/<int:view>/flat.png")
     def flat(case_id: str, view: int) -> Any:
-        angiograms = _case(desk, case_id).angiograms()
+        angiograms = _case(desk, case_id).judged()
         return _png(flat_png(angiograms[_place(view, len(angiograms))]))
 
     @app.get("/api/cases/<case_id>/views/<int:view>/found.png")
@@ -211,7 +211,7 @@ def _pictures(app: Flask, desk: Desk) -> None:
     @app.post("/api/cases/<case_id>/views/<int:view>/trace")
     def traced(case_id: str, view: int) -> Any:
         case = _case(desk, case_id)
-        angiograms, vessels = case.angiograms(), case.vessels
+        angiograms, vessels = case.judged(), case.vessels
         k = _place(view, len(angiograms))
         asked = _object()
         ends = [np.array(parse_point(key, asked.get(key))) for key in ("from", "to")]

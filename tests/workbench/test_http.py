@@ -9,6 +9,7 @@ import time
 import pytest
 
 from gcar_deploy.engine import Engine
+from gcar_deploy.workbench import http
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.worker.jobs import JobQueue
 from tests.cli.conftest import good_case  # noqa: F401 - a fixture
@@ -204,6 +205,41 @@ def test_a_picture_without_its_background_keeps_its_vessels(ask, desk):
     contrast = [float(np.median(p[away]) - np.median(p[vessel])) for p in (raw, flat)]
     spread = [float(np.std(cv2.GaussianBlur(p, (0, 0), 4)[away])) for p in (raw, flat)]
     assert contrast[1] > 0 and contrast[1] / spread[1] > contrast[0] / spread[0]
+
+
+def test_a_noisy_negative_is_read_like_the_clear_one_beside_it(ask, desk, monkeypatch):
+    """Bright vessels on a dark ground; of the second picture alone nobody could say so."""
+    import cv2
+    import numpy as np
+
+    from gcar_deploy.imaging.polarity import is_dark
+    from gcar_deploy.inputs.order import Order
+
+    source, folder = ready_case("C_0001"), desk.new_folder("negative")
+    told = json.loads((source / "geom.json").read_text())
+    rng = np.random.default_rng(3)
+    drawn = (20, 1.0), (10, 60.0)  # counts per mm, noise
+    for k, (view, (gain, noise)) in enumerate(zip(told["views"], drawn, strict=True), start=1):
+        path = cv2.imread(str(source / f"view{k}.png"), -1) * view["intensity"]["mm_per_count"]
+        grey = 40 + gain * path + rng.normal(0, noise, path.shape)
+        cv2.imwrite(str(folder / f"view{k}.png"), np.clip(grey, 0, 255).astype(np.uint8))
+        view["intensity"] = {"kind": "raw"}
+    (folder / "geom.json").write_text(json.dumps(told))
+    views = folder / "view1.png", folder / "view2.png"
+    case = desk.add(folder, Order(views=views, geometry=folder / "geom.json"))
+    alone = [is_dark(one) for one in case.angiograms()]
+    assert alone == [False, True]  # what is usual
+    assert [is_dark(one) for one in case.judged()] == [False, False]
+    assert [one.intensity.polarity for one in case.angiograms()] == ["auto", "auto"]
+    # The deepest vessel of the second picture is followed as a bright line.
+    row, column = np.unravel_index(np.argmax(cv2.GaussianBlur(path, (0, 0), 3)), path.shape)
+    body = {"from": [float(column), float(row)], "to": [float(column) + 12, float(row)]}
+    asked, real = [], http.trace
+    monkeypatch.setattr(
+        http, "trace", lambda picture, *rest: asked.append(is_dark(picture)) or real(picture, *rest)
+    )
+    answer = ask("POST", f"/api/cases/{case.id}/views/2/trace", json=body)
+    assert answer.status_code == 200 and asked == [False]
 
 
 def test_scores_of_frame_pairs_are_told_from_either_view(ask, desk):
