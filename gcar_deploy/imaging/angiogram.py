@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -138,7 +139,8 @@ class VesselImage:
     by_network : bool
         Whether the network's word is in it.
     kept : callable or None
-        Gives the same with nothing taken for a device, where something was: few pairs ask.
+        Gives the same with nothing taken for a device, where something was: few pairs ask. It is
+        made once, however often it is asked for.
     """
 
     view_id: str
@@ -162,6 +164,8 @@ class VesselImage:
         for array in arrays:
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
+        if self.kept is not None and not hasattr(self.kept, "cache_info"):
+            object.__setattr__(self, "kept", functools.cache(self.kept))
 
     @property
     def calibrated(self) -> bool:

@@ -107,6 +107,20 @@ def test_what_is_wider_than_the_device_before_it_is_the_vessel_that_it_fills(
     assert bool(list(stray_lines(view))) is asked
 
 
+def test_what_there_is_with_devices_is_made_once_however_often_it_is_asked_for() -> None:
+    asked: list[VesselImage] = []
+
+    def kept() -> VesselImage:
+        asked.append(view_of(VESSEL, CROSSING))
+        return asked[-1]
+
+    view = dataclasses.replace(view_of(VESSEL), kept=kept)
+    again = dataclasses.replace(view, catheter_mm=1.0)
+    assert view.kept is not None and again.kept is not None
+    assert view.kept() is again.kept() is view.kept()
+    assert len(asked) == 1
+
+
 def test_a_line_from_outside_is_one_that_reaches_the_border() -> None:
     view = view_of(VESSEL, CROSSING)
     assert comes_from_outside(view, view_of(CROSSING).skeleton)
