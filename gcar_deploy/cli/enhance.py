@@ -131,7 +131,7 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
             except GeometryError as error:
                 notes.append(f"its pixel size is not known: {error}")
     else:
-        pixels = read_picture(picture, ImagingOptions().limits, differs=intensity.differs)
+        pixels = read_picture(picture, ImagingOptions().limits, subtracted=intensity.subtracted)
     angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
     if pixel_mm is None:
         notes.append(

@@ -78,7 +78,7 @@ class Intensity:
             raise GeometryError("intensity.mm_per_count is missing: kind path_length needs it")
 
     @property
-    def differs(self) -> bool:
+    def subtracted(self) -> bool:
         """Whether the picture is what vessels add to another, whose noise lies about 0."""
         return self.kind in ("path_length", "attenuation")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -58,6 +59,11 @@ def absorbance(pixels: Image) -> Image:
     """
     white = max(float(np.percentile(pixels, 99.5)), 1e-12)
     return -np.log(np.clip(pixels, 0, None) / white + LOG_OFFSET, dtype=np.float32)
+
+
+def searched(pictures: Mapping[str, Image]) -> Image:
+    """Return the one of ``extract.bright_vessels`` to look for vessels in: the first, or named."""
+    return pictures.get("search", next(iter(pictures.values())))
 
 
 def fill_holes(picture: Image, holes: Mask) -> Image:

@@ -7,7 +7,7 @@ pixels are one grey value. What stands out of it is vessel, to the rim, however 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -86,7 +86,8 @@ def shadow(picture: Image, holes: Mask) -> Shadow | None:
             if deepest > 0 and spread <= _SPREAD * deepest:
                 floor = max(_DEVIATIONS * spread, _LEAST * deepest)
                 shown = np.where(seen, rise[::step, ::step], np.nan)
-                if _blocks_off(shown, floor) or _blocks_rough(shown, floor):
+                parts = _shown_blocks(shown)
+                if _blocks_off(parts, floor) or _blocks_rough(parts, floor):
                     return None
                 found = _of_rise(np.asarray(rise, np.float32), holes, (floor, deepest))
                 return found and Shadow(*found, shaded=bool(shaded))
@@ -122,19 +123,19 @@ def _shown_blocks(rise: Array) -> list[Array]:
     ]
 
 
-def _blocks_off(rise: Array, floor: float) -> bool:
+def _blocks_off(parts: Sequence[Array], floor: float) -> bool:
     """Whether the ground of some blocks lies higher or lower than that of the picture."""
-    grounds = [np.percentile(inside, 100 - _BLOCK_VESSEL) for inside in _shown_blocks(rise)]
+    grounds = [np.percentile(inside, 100 - _BLOCK_VESSEL) for inside in parts]
     off = np.abs(np.asarray(grounds) - np.median(grounds)) if grounds else np.zeros(0)
     return int((off > _OFF_SHARE * floor).sum()) > _BLOCKS_OFF
 
 
-def _blocks_rough(rise: Array, floor: float) -> bool:
+def _blocks_rough(parts: Sequence[Array], floor: float) -> bool:
     """Whether the grain of some block would pass for vessel: it stands out the other way as well.
 
     Of the same light a logarithm makes more noise where the picture is dark.
     """
-    for inside in _shown_blocks(rise):
+    for inside in parts:
         middle = float(np.median(inside))
         if middle < floor and float((inside < middle - floor).mean()) > _OTHER_WAY:
             return True
@@ -179,16 +180,16 @@ def _of_rise(rise: Image, holes: Mask, levels: tuple[float, float]) -> tuple[Mas
         return None
     reach = rise > floor
     line = skel.skeletonize(reach)
-    half_width = cv2.distanceTransform(reach.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    wide = half_width.max() > _HALF_WIDTH * min(rise.shape)
+    wide = skel.to_rim(reach).max() > _HALF_WIDTH * min(rise.shape)
     if not line.any() or reach.mean() > _AREA or wide:
         return None
     kept = skel.strong_parts(_on_ground(line, reach, rise), rise, PART_SHARE)
     if not kept.any():
         return None
-    if _across(reach & skel.beside(reach, line, kept), holes):
+    own = skel.beside(reach, line, kept)
+    if _across(own, holes):
         return None
     _, (peak,) = skel.spread(line, (rise,), _ALONG_PX)
-    mask = ((rise > RIM_SHARE * peak) | kept) & skel.beside(reach, line, kept)
+    mask = ((rise > RIM_SHARE * peak) | kept) & own
     dark = rise[mask] >= _NEARLY * deepest
     return mask, bool(dark.mean() >= _FLAT_SHARE)

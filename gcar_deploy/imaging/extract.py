@@ -175,7 +175,7 @@ def _from_shadow(
         view = without_device(view, filtered.catheter, filtered.catheter_mm)
     if drawn.flat or segmenter is None or options.segmenter == "classic":
         return view
-    search = grey[0].get("search", next(iter(grey[0].values())))
+    search = enhance.searched(grey[0])
     return without_devices(view, search, grey[1], segmenter)
 
 
@@ -301,7 +301,7 @@ def _lines(
     """
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
     pictures, holes = grey
-    search = pictures.get("search", next(iter(pictures.values())))
+    search = enhance.searched(pictures)
     path_mm, kept = None, None
     if angiogram.mask is not None:
         found = segment.given(search, angiogram.mask & ~holes, holes, pixel_mm)

@@ -79,7 +79,7 @@ def learned_vessels(
     kept : gives the same with nothing taken for a device; None where nothing was, or where frames
         before contrast say what is one
     """
-    search = pictures.get("search", next(iter(pictures.values())))
+    search = enhance.searched(pictures)
     work, work_holes = at_network_size(search, holes)
     fine = net_input(work, work_holes)
     seen = segmenter.look(fine)
@@ -103,7 +103,7 @@ def _found(
     device: Mask, told: Image,
 ) -> Found:  # fmt: skip
     """Draw what is seen, without holes and devices; see ``learned_vessels``."""
-    search = pictures.get("search", next(iter(pictures.values())))
+    search = enhance.searched(pictures)
     other = work_holes | device
     seen = dataclasses.replace(seen, probability=np.where(other, np.float32(0), seen.probability))
     full = search.shape[::-1]
@@ -141,7 +141,7 @@ def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -
     pixel_mm = NOMINAL_MM / finer
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / pixel_mm)
     sigma_px = enhance.ridges(flat, pixel_mm).sigma_px
-    half = cv2.distanceTransform(reach.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    half = skel.to_rim(reach)
     found = np.zeros_like(reach)
     course = catheters(line, flat, sigma_px, ~holes, pixel_mm)
     for part in (course, *device_parts(line, told, DEVICE_LEVEL, finer)):

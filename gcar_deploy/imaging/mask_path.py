@@ -69,7 +69,7 @@ def _chords(box: Mask, parts: int) -> Image:
     if not line.any():
         return np.zeros(box.shape, np.float32)
     # to the centre of the first pixel outside, half a pixel too far
-    edge = cv2.distanceTransform(vessel.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
+    edge = skel.to_rim(vessel) - 0.5
     distance, radius = skel.averaged(line, vessel, edge, ALONG_SIGMA_PX * parts)
     # In a fork the nearest line may be that of the thinner vessel.
     radius = np.maximum(radius, edge)

@@ -30,7 +30,7 @@ _SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
 
 
 def read_picture(
-    path: str | Path, limits: PictureLimits | None = None, *, differs: bool = False
+    path: str | Path, limits: PictureLimits | None = None, *, subtracted: bool = False
 ) -> tuple[Image, int, str]:
     """Read a picture; the file is opened once, only for reading.
 
@@ -41,7 +41,7 @@ def read_picture(
         transparency; TIFF also non-negative float32) or ``.npy`` (2-D uint8, uint16, or finite
         non-negative float32/64).
     limits : PictureLimits, optional
-    differs : bool, the picture is a difference whose noise lies about 0; see ``from_zero``
+    subtracted : bool, another picture was, so that noise lies about 0; see ``from_zero``
 
     Returns
     -------
@@ -58,9 +58,12 @@ def read_picture(
     path = Path(path)
     try:
         data = read_bounded(path, limits.max_bytes)
-        pixels, depth = _decode(data, path.suffix.lower(), limits, differs)
+        array, depth = _decode(data, path.suffix.lower(), limits)
+        array = from_zero(array) if subtracted else array
+        _check_counts(array)
     except ValueError as error:
         raise ImageError(f"{path.name}: {error}") from None
+    pixels = np.ascontiguousarray(array, dtype=np.float32)
     sha256 = hashlib.sha256(data).hexdigest()
     _log.debug("read %d bytes, %s, %d bit, sha256 %s", len(data), pixels.shape, depth, sha256)
     return pixels, depth, sha256
@@ -118,7 +121,7 @@ def read_stack(path: str | Path, limits: DicomLimits) -> tuple[list[Image], int,
     return [page.astype(np.float32) for page in grey], depth, hashlib.sha256(data).hexdigest()
 
 
-def _decode(data: bytes, suffix: str, limits: PictureLimits, differs: bool) -> tuple[Image, int]:
+def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Array, int]:
     expected = _SUFFIXES.get(suffix)
     if data.startswith(_JPEG_SIGNATURE):
         raise ValueError(
@@ -131,7 +134,7 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits, differs: bool) -> t
         what = f"is a {found} file" if found else f"is not a {expected} file"
         raise ValueError(f"{what} though it is named {suffix}; export it as {expected}")
     if found == "NPY":
-        return _decode_npy(data, limits, differs)
+        return _decode_npy(data, limits)
     check = png_guard.check_png if found == "PNG" else png_guard.check_tiff
     depth = check(data, limits.min_side, limits.max_side)
     try:
@@ -143,9 +146,7 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits, differs: bool) -> t
         raise ValueError("cannot be decoded (damaged or unusual); export it again as 8/16 bit grey")
     grey = _one_channel(picture)
     png_guard.check_sides(grey.shape[0], grey.shape[1], limits.min_side, limits.max_side)
-    grey = from_zero(grey) if differs else grey
-    _check_counts(grey)
-    return grey.astype(np.float32), depth
+    return grey, depth
 
 
 def _sniff(data: bytes) -> str | None:
@@ -169,7 +170,7 @@ def _one_channel(picture: Array) -> Array:
     return picture[..., 0]
 
 
-def _decode_npy(data: bytes, limits: PictureLimits, differs: bool) -> tuple[Image, int]:
+def _decode_npy(data: bytes, limits: PictureLimits) -> tuple[Array, int]:
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)
@@ -191,13 +192,11 @@ def _decode_npy(data: bytes, limits: PictureLimits, differs: bool) -> tuple[Imag
         raise ValueError("is truncated or has bytes to spare; save it again with numpy.save")
     array = np.frombuffer(data, dtype, offset=stream.tell())
     array = array.reshape(shape, order="F" if fortran else "C")
-    array = from_zero(array) if differs else array
-    _check_counts(array)
-    return np.ascontiguousarray(array, dtype=np.float32), _NPY_DEPTH[dtype.newbyteorder("=").name]
+    return array, _NPY_DEPTH[dtype.newbyteorder("=").name]
 
 
 def from_zero(array: Array) -> Array:
-    """Return a difference of pictures without what lies below 0, if that is but its noise.
+    """Return a subtracted picture without what lies below 0, if that is but its noise.
 
     What is as far below 0 as anything above it is no noise, and left for others to refuse.
     """

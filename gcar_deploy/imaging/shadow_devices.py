@@ -15,7 +15,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.catheter import BORDER_MM
 from gcar_deploy.imaging.device_lines import device_map
-from gcar_deploy.imaging.fusion import without_device
+from gcar_deploy.imaging.fusion import without_lines
 from gcar_deploy.imaging.learned import devices
 from gcar_deploy.imaging.net import Segmenter, at_network_size, net_input
 from gcar_deploy.imaging.resample import resize
@@ -59,11 +59,13 @@ def without_devices(
     if not device.any():
         return asked
     where = resize(device.astype(np.float32), full) >= 0.5
-    length_mm = int((view.skeleton & where).sum()) * pixel_mm
-    left = without_device(asked, where, view.catheter_mm + length_mm)
+    left = without_lines(asked, where)
     if left.mask.sum() == view.mask.sum():
         return asked
     before = np.zeros_like(where) if view.catheter is None else view.catheter
     return dataclasses.replace(
-        left, catheter=(before | where | view.mask) & ~left.mask, kept=lambda: view
+        left,
+        catheter=(before | where | view.mask) & ~left.mask,
+        catheter_mm=view.catheter_mm + int((view.skeleton & where).sum()) * pixel_mm,
+        kept=lambda: view,
     )

@@ -48,7 +48,7 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
     yield from (label == k for k in range(1, count)
                 if k != size.argmax() and size[k] >= SHORTEST_MM * px)  # fmt: skip
     graph = LineGraph(line)
-    near = inward_px(view.valid) <= BORDER_MM * px
+    near = _near_border(view)
     for end in graph.ends(line & (near | _beside_device(view, px))):
         if not near[end] and _fills(view, graph, end, px):
             continue
@@ -76,11 +76,11 @@ def _fills(view: VesselImage, graph: LineGraph, end: Pixel, px: float) -> bool:
     whole = view if view.kept is None else view.kept()
     before = np.argwhere(_lost(view, whole))
     before = before[np.hypot(*(before - end).T) <= last]
-    if len(path) < first or not len(before):
+    if len(path) <= first or not len(before):
         return False
-    half = cv2.distanceTransform(whole.mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    own = float(np.median(half[tuple(np.transpose(path[first:]))])) if len(path) > first else 0.0
-    return own >= WIDER * float(np.median(half[tuple(before.T)]))
+    half = skel.to_rim(whole.mask)
+    own, device = (float(np.median(half[tuple(np.transpose(p))])) for p in (path[first:], before))
+    return own >= WIDER * device
 
 
 def likely_devices(view: VesselImage, level: float) -> Iterator[Mask]:
@@ -119,8 +119,12 @@ def lost_lines(view: VesselImage, whole: VesselImage) -> Iterator[Mask]:
 
 def comes_from_outside(view: VesselImage, line: Mask) -> bool:
     """Whether a line reaches the border of the field."""
-    near = inward_px(view.valid) * view.carm.pixel_at_isocenter_mm <= BORDER_MM
-    return bool((line & near).any())
+    return bool((line & _near_border(view)).any())
+
+
+def _near_border(view: VesselImage) -> Mask:
+    near: Mask = inward_px(view.valid) <= BORDER_MM / view.carm.pixel_at_isocenter_mm
+    return near
 
 
 def with_line(view: VesselImage, whole: VesselImage, lost: Mask) -> VesselImage:

@@ -49,13 +49,11 @@ def own_widths(view: VesselImage) -> VesselImage:
     return dataclasses.replace(view, path_mm=path_mm)
 
 
-def with_widths(view: VesselImage) -> VesselImage:
-    """Let widths have a word about the view, its ``others``, and what it would be with devices."""
+def others_too(view: VesselImage) -> VesselImage:
+    """After ``own_widths`` let them have it about ``others``, and what it would be with devices."""
     others, kept = tuple(own_widths(other) for other in view.others), view.kept
-    return dataclasses.replace(
-        own_widths(view), others=others,
-        kept=None if kept is None else lambda: own_widths(kept()),
-    )  # fmt: skip
+    kept_too = None if kept is None else lambda: own_widths(kept())
+    return dataclasses.replace(view, others=others, kept=kept_too)
 
 
 def tempered(path_mm: Image, mask: Mask, pixel_mm: float) -> Image:

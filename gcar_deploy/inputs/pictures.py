@@ -210,7 +210,7 @@ def _angiogram(
     if isinstance(picture, np.ndarray):
         read = _from_array(view, picture, options.limits)
     else:
-        read = read_picture(picture, options.limits, differs=view.intensity.differs)
+        read = read_picture(picture, options.limits, subtracted=view.intensity.subtracted)
     return _as_angiogram(read, view, options, notes, picture)
 
 
@@ -281,7 +281,7 @@ def _from_array(
             f"view {view_id}: {array.shape[0]} x {array.shape[1]} pixels; each side must be "
             f"{limits.min_side} .. {limits.max_side}"
         )
-    given, array = array, from_zero(array) if view.intensity.differs else array
+    given, array = array, from_zero(array) if view.intensity.subtracted else array
     if not (np.isfinite(array).all() and array.min() >= 0):
         raise ImageError(f"view {view_id}: grey values must be finite and not negative")
     sha256 = hashlib.sha256(f"{given.dtype.name}{given.shape}".encode())

@@ -13,7 +13,7 @@ from gcar_deploy.config import PoseOptions, RunOptions
 from gcar_deploy.geometry.consistency import Mass, disagreement, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.resample import sampled_path
-from gcar_deploy.imaging.widths import by_width, own_widths, with_widths
+from gcar_deploy.imaging.widths import by_width, others_too, own_widths
 from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
@@ -65,9 +65,8 @@ def agreeing(
     def judge(tried: Sequence[VesselImage], placed: Sequence[Pose]) -> tuple[Pose, ...]:
         return poses_between(tried, options, placed)
 
-    first = poses = estimate(views)
-    views, poses = _with_widths(views, asked, poses, estimate)
-    seen, first = views, poses
+    views, first = _with_widths(views, asked, estimate(views), estimate)
+    seen, poses = views, first
     for readings in (_by_method, _likeliest):
         tried = seen
         seen, poses = _closest(tried, poses, readings(views, first, options), options)
@@ -97,8 +96,7 @@ def _with_widths(
     if max(p.after for p in closer) >= GAIN * max(p.after for p in poses):
         return views, poses
     _log.info("the views agree far better where widths have a word about path lengths")
-    whole = [with_widths(view) if may else view for view, may in zip(views, asked, strict=True)]
-    return whole, closer
+    return [others_too(view) if may else view for view, may in zip(own, asked, strict=True)], closer
 
 
 def _changed(now: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[str]:

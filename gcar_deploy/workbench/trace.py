@@ -9,6 +9,7 @@ from scipy import ndimage
 from skimage.graph import route_through_array
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import bright_vessels
 from gcar_deploy.imaging.polarity import is_dark
@@ -71,7 +72,7 @@ def bright_picture(angiogram: Angiogram) -> Image:
     if kind in ("path_length", "mask"):
         return angiogram.pixels
     pictures, _ = bright_vessels(angiogram.pixels, kind, is_dark(angiogram))
-    return pictures.get("search", next(iter(pictures.values())))
+    return enhance.searched(pictures)
 
 
 def _ridges(picture: Image) -> tuple[Image, Image]:

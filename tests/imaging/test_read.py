@@ -235,10 +235,10 @@ def test_noise_about_zero_is_no_fault_of_a_difference(tmp_path, suffix):
     path.write_bytes(_npy(picture) if suffix == ".npy" else _encoded(suffix, picture))
     with pytest.raises(ImageError, match="negative"):
         read_picture(path)
-    pixels, depth, _ = read_picture(path, differs=True)
+    pixels, depth, _ = read_picture(path, subtracted=True)
     np.testing.assert_array_equal(pixels, np.maximum(picture, 0))
     assert depth == 32
     # As far below as above is no noise: vessels are dark in it, say.
     path.write_bytes(_npy(-picture) if suffix == ".npy" else _encoded(suffix, -picture))
     with pytest.raises(ImageError, match="negative"):
-        read_picture(path, differs=True)
+        read_picture(path, subtracted=True)

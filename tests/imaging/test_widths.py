@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gcar_deploy.imaging.widths import WIDTH_SHARE, own_widths, tempered, with_widths
+from gcar_deploy.imaging.widths import WIDTH_SHARE, others_too, own_widths, tempered
 from tests.imaging.phantoms import PIXEL_MM
 from tests.imaging.test_stray_lines import view_of
 
@@ -67,7 +67,7 @@ def test_only_what_the_network_drew_is_asked():
     view = view_of((slice(20, 30), slice(20, 200)), (slice(60, 63), slice(20, 200)))
     assert own_widths(view) is view
     drawn = dataclasses.replace(view, by_network=True, others=(view,), kept=lambda: view)
-    changed = with_widths(drawn)
+    changed = others_too(own_widths(drawn))
     assert changed.path_mm[25, 100] > 1.2 * changed.path_mm[61, 100]
     assert changed.others[0] is view  # the filter's view
     assert changed.kept is not None and changed.kept() is view
