@@ -176,9 +176,8 @@ def three_raw_views_with_the_table_moved():
 
 
 @pytest.mark.slow
-def test_three_views_are_placed_as_run_places_them(monkeypatch):
+def test_three_views_are_placed_as_run_places_them():
     """Also by the tree that they show, and what is said of the correction is the same."""
-    monkeypatch.setattr("gcar_deploy.pose.bundling.LEAST_PX", 0.0)
     angiograms, grid = three_raw_views_with_the_table_moved()
     options = RunOptions(
         predict=PredictOptions(predictor="none"), refine=RefineOptions(refiner="none"),

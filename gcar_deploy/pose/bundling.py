@@ -15,18 +15,16 @@ from gcar_deploy.pose.bundle_adjustment import adjust
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.pose.profile_fit import MIN_GAIN
+from gcar_deploy.quality import unexplained
 from gcar_deploy.tree.tree import Tree
 
 #: a tree and its views' poses are fitted to each other at most so often
-ROUNDS = 2
-#: a tree that lies this near to all lines, in pixels, is left alone (16 generated scenes, moved and
-#: corrected by profiles: 0.2 .. 0.5); else the distance must fall to ``MIN_GAIN`` of what it was
-LEAST_PX = 0.6
+ROUNDS = 4
 #: makes a tree of views that have their corrections built in
 TreeOf: TypeAlias = Callable[[Sequence[VesselImage]], Tree]
 #: a view that moves by less than this between rounds has arrived, mm; and within a round, by less
 #: than this a step, mm or deg
-ARRIVED_MM, ARRIVED_STEP = 0.5, 0.05
+ARRIVED_MM, ARRIVED_STEP = 0.15, 0.05
 
 
 def bundled(
@@ -36,6 +34,9 @@ def bundled(
     options: RunOptions,
 ) -> tuple[Pose, ...]:
     """Fit tree and poses to each other in turn.
+
+    Mass profiles have many local minima. So the views stay as they are told where the tree that
+    they show so explains as much of their lines.
 
     Parameters
     ----------
@@ -48,7 +49,8 @@ def bundled(
     -------
     V poses with what the profiles say of them: as given with fewer than three views, where no
     view had to be moved, where all pictures are calibrated (their profiles place them more exactly
-    than lines do), or where the adjustment does not bring the tree clearly nearer to the pictures
+    than lines do), or where the adjustment does not bring the tree clearly nearer to the pictures;
+    zero where the views stay
     """
     told = [view.carm for view in views]
     first = poses = tuple(poses)
@@ -57,24 +59,51 @@ def bundled(
     if not any(pose.theta.any() for pose in poses):
         return poses
     marks = landmark_pixels(options.landmarks, told)
-    for _ in range(ROUNDS):
+    tree = _seen_so(views, poses, tree_of)
+    still = tuple(dataclasses.replace(p.at(np.zeros(5)), converged=True) for p in poses)
+    # Marks are a person's word for where the views stand.
+    if not len(marks) and _explained(
+        _seen_so(views, still, tree_of), views, still, options
+    ) >= _explained(tree, views, poses, options):
+        return poses_between(views, options, still)
+    last_mm = np.inf
+    for round_ in range(ROUNDS):
         theta = np.stack([pose.theta for pose in poses])
-        tree = tree_of([posed(view, pose) for view, pose in zip(views, poses, strict=True)])
+        if round_:
+            tree = _seen_so(views, poses, tree_of)
         found = adjust(tree, views, told, theta, marks)
-        near_mm = LEAST_PX * max(carm.pixel_at_isocenter_mm for carm in told)
-        if found.before_mm < near_mm or found.after_mm >= MIN_GAIN * found.before_mm:
+        if found.after_mm >= MIN_GAIN * found.before_mm:
             if poses is not first:  # the last round stands
                 poses = tuple(dataclasses.replace(pose, converged=True) for pose in poses)
             break
         arrived = bool(np.abs(found.theta - theta)[:, :3].max() < ARRIVED_MM)
-        still = arrived and found.moving < ARRIVED_STEP
+        # Along what the lines do not see, views go on moving while the tree comes no nearer.
+        settled = (arrived and found.moving < ARRIVED_STEP) or (
+            found.before_mm >= MIN_GAIN * last_mm
+        )
+        last_mm = found.before_mm
         poses = tuple(
-            dataclasses.replace(pose.at(t), converged=still)
+            dataclasses.replace(pose.at(t), converged=settled)
             for pose, t in zip(poses, found.theta, strict=True)
         )
         if arrived:
             break
     return first if poses == first else poses_between(views, options, poses)
+
+
+def _seen_so(views: Sequence[VesselImage], poses: Sequence[Pose], tree_of: TreeOf) -> Tree:
+    return tree_of([posed(view, pose) for view, pose in zip(views, poses, strict=True)])
+
+
+def _explained(
+    tree: Tree, views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
+) -> float:
+    """Share of the views' lines near the reprojected tree, 0 .. 1, on average over the views."""
+    shares = []
+    for view, pose in zip(views, poses, strict=True):
+        left = unexplained(tree, posed(view, pose), options.quality)
+        shares.append(1.0 - left.sum() / max(int((view.skeleton & view.valid).sum()), 1))
+    return float(np.mean(shares))
 
 
 def posed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -12,7 +12,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.pose import bundle_adjustment
 from gcar_deploy.pose.bundle_adjustment import adjust
-from gcar_deploy.pose.bundling import LEAST_PX, bundled
+from gcar_deploy.pose.bundling import bundled
 from gcar_deploy.pose.joint import corrected
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.tree.tree import Branch, Tree
@@ -99,7 +99,7 @@ def test_a_right_pose_stays():
     told, views, points = scene(3, 4)
     theta = off_by(3, 0.0)
     found = adjust(tree_of(points), views, told, theta)
-    assert found.before_mm < LEAST_PX * told[0].pixel_at_isocenter_mm
+    assert found.before_mm < 0.6 * told[0].pixel_at_isocenter_mm
     assert miss_mm(told, found.theta, points) < 0.45
 
 
@@ -154,6 +154,7 @@ def test_rounds_of_tree_and_poses():
     first = tuple(Pose(offset_mm=tuple(t[:3])) for t in off_by(4, 3.0))
     found = bundled(views, first, made, RunOptions())
     assert miss_mm(told, [p.theta for p in found], points) < 0.5
+    assert all(p.converged for p in found)
 
     def never(_):
         raise AssertionError("a tree is made for nothing")
@@ -163,3 +164,45 @@ def test_rounds_of_tree_and_poses():
     assert bundled(exact, first, never, RunOptions()) == first
     still = (Pose(),) * 4
     assert bundled(views, still, never, RunOptions()) == still
+
+
+def test_views_that_are_told_rightly_stay():
+    """Profiles may agree better elsewhere, but no tree explains as much of the lines there."""
+    told, views, points = scene(4, 4)
+    right = [carm.moved(shift) for carm, shift in zip(told, MOVED, strict=True)]
+    views = [dataclasses.replace(view, carm=c) for view, c in zip(views, right, strict=True)]
+    pixels = [[c.project(p)[0] for c in right] for p in points]
+
+    def made(placed):
+        carms = [view.carm for view in placed]
+        return tree_of([triangulate(carms, seen)[0] for seen in pixels])
+
+    wrong = [Pose(), *(Pose(offset_mm=tuple(4.0 * np.roll([1, -1, 0], k))) for k in range(3))]
+    found = bundled(views, wrong, made, RunOptions())
+    assert not any(pose.theta.any() for pose in found)
+    assert found[1].after == found[1].before
+
+    # who marked points has the say where the views stand
+    spots = np.concatenate(points)[::50]
+    marks = tuple(tuple(tuple(c.project(spots)[0][k]) for c in right) for k in range(len(spots)))
+    assert any(p.theta.any() for p in bundled(views, wrong, made, RunOptions(landmarks=marks)))
+
+
+@pytest.mark.parametrize(("falls", "settled"), [(0.6, False), (0.95, True)])
+def test_rounds_end_at_their_best_or_say_that_they_did_not(monkeypatch, falls, settled):
+    """Views that move on along what no line sees have arrived when the tree comes no nearer."""
+    _, views, points = scene(3, 4)
+    before = [2.0]
+
+    def moved_on(tree, views, told, theta, marks):
+        before.append(before[-1] * falls)
+        on = theta + np.array([[0.0], [1.0], [1.0]])
+        return bundle_adjustment.Adjusted(on, before[-1], 0.1 * before[-1], moving=1.0)
+
+    monkeypatch.setattr("gcar_deploy.pose.bundling.adjust", moved_on)
+    monkeypatch.setattr("gcar_deploy.pose.bundling._explained", lambda tree, v, poses, o: max(
+        float(np.abs(pose.theta).max()) for pose in poses))  # fmt: skip
+    first = tuple(Pose(offset_mm=tuple(t[:3])) for t in off_by(3, 0.0))
+    found = bundled(views, first, lambda _: tree_of(points), RunOptions())
+    assert [pose.converged for pose in found] == [settled] * 3
+    assert found[1].offset_mm[0] == pytest.approx(first[1].offset_mm[0] + 4.0)
