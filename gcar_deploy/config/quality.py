@@ -66,6 +66,9 @@ class QualityOptions:
     #: than nine tenths is worth a word whatever the costs say. By pixels, thin ends that lie below
     #: a lattice cell took ``ok`` from right trees
     good_coverage: Share = 0.9
+    #: Three and more masks or raw pictures that agree poorly may be of one tree from this share on,
+    #: by pixels of each view: what suits three pictures by chance is little
+    enough_coverage: Share = 0.7
     min_coverage: Share = 0.3
     #: share of the reprojected tree that lies on the view's vessels: 0.94 and more in pairs of
     #: path lengths of one tree, but 0.6 and more in raw ones, whose masks are what two methods

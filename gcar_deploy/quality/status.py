@@ -208,9 +208,11 @@ def check_explained(
     """
     findings = []
     doubtful = (disagreement or 0.0) > disagreement_limits(kind, options)[0]
+    several = len(views) > 2 and kind != "exact"
+    enough = options.enough_coverage if several else options.good_coverage
     for one in views:
         # A tree of two patients misses thin vessels first.
-        if doubtful and (one.coverage_even or 0.0) < options.good_coverage:
+        if doubtful and (one.coverage_even or 0.0) < enough:
             raise RefusedError(
                 f"the views contradict each other: {disagreement:.0%} of the vessels differ along "
                 f"the epipolar lines, and no tree explains more than "

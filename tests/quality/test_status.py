@@ -10,7 +10,7 @@ import pytest
 from gcar_deploy.config import ImagingOptions, QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.quality.status import assess, part_lengths_mm, view_quality
+from gcar_deploy.quality.status import assess, check_explained, part_lengths_mm, view_quality
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.hard.phantoms import both, paths, straight
@@ -73,6 +73,22 @@ def test_doubtful_views_that_no_tree_explains_contradict(case):
         assess(part, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS)
     assert assess(part, views, masks, [], OPTIONS.good_disagreement, OPTIONS).status == "degraded"
     assert assess(tree, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS).status == "ok"
+
+
+@pytest.mark.parametrize("kind", ["mask", "raw"])
+def test_several_views_that_agree_poorly_may_leave_more_unexplained_than_two(case, kind):
+    _, views, tree = case
+    one = view_quality(tree, views[0], views[0].mask, OPTIONS)
+    doubt = OPTIONS.max_disagreement_mask - 0.1
+
+    def judged(even, count, of=kind):
+        seen = [dataclasses.replace(one, coverage=0.95, support=0.95, coverage_even=even)] * count
+        return check_explained(seen, doubt, of, OPTIONS)
+
+    assert judged(0.71, 3) == []
+    for even, count, of in ((0.71, 2, kind), (0.69, 3, kind), (0.71, 3, "exact")):
+        with pytest.raises(RefusedError, match="contradict"):
+            judged(even, count, of)
 
 
 def test_match_rate_and_strict_coverage(case):
