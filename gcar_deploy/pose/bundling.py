@@ -59,18 +59,19 @@ def bundled(
     if not any(pose.theta.any() for pose in poses):
         return poses
     marks = landmark_pixels(options.landmarks, told)
-    tree = _seen_so(views, poses, tree_of)
-    still = tuple(dataclasses.replace(p.at(np.zeros(5)), converged=True) for p in poses)
+    placed = _placed(views, poses)
+    tree = tree_of(placed)
     # Marks are a person's word for where the views stand.
-    if not len(marks) and _explained(
-        _seen_so(views, still, tree_of), views, still, options
-    ) >= _explained(tree, views, poses, options):
-        return poses_between(views, options, still)
+    if not len(marks):
+        stays = _explained(tree_of(views), views, options)
+        if stays >= _explained(tree, placed, options):
+            still = [dataclasses.replace(p.at(np.zeros(5)), converged=True) for p in poses]
+            return poses_between(views, options, still)
     last_mm = np.inf
     for round_ in range(ROUNDS):
-        theta = np.stack([pose.theta for pose in poses])
         if round_:
-            tree = _seen_so(views, poses, tree_of)
+            tree = tree_of(_placed(views, poses))
+        theta = np.stack([pose.theta for pose in poses])
         found = adjust(tree, views, told, theta, marks)
         if found.after_mm >= MIN_GAIN * found.before_mm:
             if poses is not first:  # the last round stands
@@ -91,17 +92,15 @@ def bundled(
     return first if poses == first else poses_between(views, options, poses)
 
 
-def _seen_so(views: Sequence[VesselImage], poses: Sequence[Pose], tree_of: TreeOf) -> Tree:
-    return tree_of([posed(view, pose) for view, pose in zip(views, poses, strict=True)])
+def _placed(views: Sequence[VesselImage], poses: Sequence[Pose]) -> list[VesselImage]:
+    return [posed(view, pose) for view, pose in zip(views, poses, strict=True)]
 
 
-def _explained(
-    tree: Tree, views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions
-) -> float:
+def _explained(tree: Tree, placed: Sequence[VesselImage], options: RunOptions) -> float:
     """Share of the views' lines near the reprojected tree, 0 .. 1, on average over the views."""
     shares = []
-    for view, pose in zip(views, poses, strict=True):
-        left = unexplained(tree, posed(view, pose), options.quality)
+    for view in placed:
+        left = unexplained(tree, view, options.quality)
         shares.append(1.0 - left.sum() / max(int((view.skeleton & view.valid).sum()), 1))
     return float(np.mean(shares))
 

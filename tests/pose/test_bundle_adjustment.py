@@ -200,8 +200,9 @@ def test_rounds_end_at_their_best_or_say_that_they_did_not(monkeypatch, falls, s
         return bundle_adjustment.Adjusted(on, before[-1], 0.1 * before[-1], moving=1.0)
 
     monkeypatch.setattr("gcar_deploy.pose.bundling.adjust", moved_on)
-    monkeypatch.setattr("gcar_deploy.pose.bundling._explained", lambda tree, v, poses, o: max(
-        float(np.abs(pose.theta).max()) for pose in poses))  # fmt: skip
+    monkeypatch.setattr("gcar_deploy.pose.bundling._explained", lambda tree, placed, options: max(
+        float(np.abs(np.subtract(v.carm.isocenter_offset_mm, view.carm.isocenter_offset_mm)).max())
+        for v, view in zip(placed, views, strict=True)))  # fmt: skip
     first = tuple(Pose(offset_mm=tuple(t[:3])) for t in off_by(3, 0.0))
     found = bundled(views, first, lambda _: tree_of(points), RunOptions())
     assert [pose.converged for pose in found] == [settled] * 3
