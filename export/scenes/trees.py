@@ -17,6 +17,8 @@ import dataclasses
 
 import numpy as np
 
+from gcar_deploy.tree.curves import resample
+from gcar_deploy.types import Points
 from gcar_export.scenes.tree_curves import (
     MURRAY,
     STEP_MM,
@@ -77,6 +79,10 @@ class SyntheticTree:
         ends = np.concatenate([v.points_mm[1:] for v in self.vessels])
         radii = np.concatenate([0.5 * (v.radius_mm[1:] + v.radius_mm[:-1]) for v in self.vessels])
         return starts, ends, radii
+
+    def line(self, step_mm: float = 0.5) -> Points:
+        """(n, 3) points of the centrelines, mm, so far apart."""
+        return np.concatenate([resample(v.points_mm, step_mm) for v in self.vessels])
 
     def sides(self, which: str) -> SyntheticTree:
         """Keep the ``left`` or ``right`` vessels alone, centred anew."""

@@ -12,12 +12,9 @@ shift alike leaves no trace: the found line is laid over the true one before a p
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Iterator, Sequence
 
-import click
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
@@ -33,6 +30,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Points
 from gcar_export.scenes.cine import CinePair, CineRun, cine_pair
+from gcar_export.studies.command import arguments, print_table
 from gcar_export.studies.pair_rows import Judged, head, row
 
 SEED, FRAMES = 7_400, 8
@@ -146,16 +144,11 @@ def table(rows: Sequence[tuple[str, *Judged]]) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--patients", type=int, default=24)
-    parser.add_argument("--seed", type=int, default=SEED)
+    parser = arguments(__doc__, "--patients", 24, SEED)
     parser.add_argument("--wait", type=int, default=0)
     asked = parser.parse_args()
     found = judged(asked.seed, asked.patients, asked.wait)
-    with click.progressbar(
-        found, length=len(names(asked.wait)) * asked.patients, file=sys.stderr
-    ) as bar:
-        print(table(list(bar)))
+    print_table(found, len(names(asked.wait)) * asked.patients, table)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,6 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.measure.metrics import VOLUME_THRESHOLD, skeleton
-from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Image, Points, Volume
 from gcar_export.scenes.labels import read_label
 from gcar_export.scenes.pictures import spoil
@@ -115,9 +114,8 @@ def side_of(pictures: str) -> str:
 def generated_subject(seed: int, number: int, side: str = "left") -> Subject:
     """Tree ``number`` of a population of generated ones."""
     tree = random_tree(np.random.default_rng([seed, number])).sides(side)
-    segments = tree.segments()
+    segments, line = tree.segments(), tree.line()
     grid = case_geometry("clinical", 2)[1]
-    line = np.concatenate([resample(vessel.points_mm, 0.5) for vessel in tree.vessels])
     return Subject(
         name=str(number),
         side=side,

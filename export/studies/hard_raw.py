@@ -10,12 +10,9 @@ line passes within ``NEAR_MM``.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Iterator, Sequence
 
-import click
 import numpy as np
 
 from gcar_deploy.engine import Engine
@@ -23,12 +20,12 @@ from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Points
 from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import any_style, random_tree
+from gcar_export.studies.command import arguments, print_table
 from gcar_export.studies.pair_rows import Judged, head, row, shares
 from gcar_export.studies.wrong_scenes import SIDES
 
@@ -65,8 +62,7 @@ def raw_pair(seed: int, number: int) -> RawPair:
         )
         for k, carm in enumerate(turned)
     )  # fmt: skip
-    line = np.concatenate([resample(v.points_mm, 0.5) for v in tree.vessels])
-    return RawPair((one, two), grid, line)
+    return RawPair((one, two), grid, tree.line())
 
 
 def judged(seed: int, pairs: int) -> Iterator[tuple[str, *Judged]]:
@@ -95,13 +91,8 @@ def table(rows: Sequence[tuple[str, *Judged]]) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pairs", type=int, default=30)
-    parser.add_argument("--seed", type=int, default=SEED)
-    asked = parser.parse_args()
-    found = judged(asked.seed, asked.pairs)
-    with click.progressbar(found, length=2 * asked.pairs, file=sys.stderr) as bar:
-        print(table(list(bar)))
+    asked = arguments(__doc__, "--pairs", 30, SEED).parse_args()
+    print_table(judged(asked.seed, asked.pairs), 2 * asked.pairs, table)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,8 @@ within ``NEAR_MM``.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterator
 
-import click
 import numpy as np
 
 from gcar_deploy.engine import Engine
@@ -22,6 +20,7 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Array
 from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
+from gcar_export.studies.command import print_table
 from gcar_export.studies.pair_rows import shares
 from gcar_export.studies.wrong_scenes import Exam, exam
 
@@ -134,8 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pairs", type=int, default=10)
     pairs = parser.parse_args().pairs
-    with click.progressbar(judged(pairs), length=pairs * len(LOOKS), file=sys.stderr) as bar:
-        print(table(list(bar)))
+    print_table(judged(pairs), pairs * len(LOOKS), table)
 
 
 if __name__ == "__main__":

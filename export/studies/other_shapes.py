@@ -10,12 +10,9 @@ tree may be wrong, but ``ok`` should not stand beside it: the last column of the
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Iterator, Sequence
 
-import click
 import numpy as np
 
 from gcar_deploy.engine import Engine
@@ -30,6 +27,7 @@ from gcar_export.scenes.protocols import MASK_PATH_MM
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.shapes import SHAPES, shape
+from gcar_export.studies.command import arguments, print_table
 from gcar_export.studies.pair_rows import Judged, head, row, shares
 
 SEED = 5
@@ -126,16 +124,13 @@ def table(rows: Sequence[tuple[str, str, *Judged]]) -> str:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=len(SHAPES) * len(CARMS))
-    parser.add_argument("--seed", type=int, default=SEED)
+    parser = arguments(__doc__, "--scenes", len(SHAPES) * len(CARMS), SEED)
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--model", default=None)
     asked = parser.parse_args()
     kinds = asked.kinds.split(",")
     found = judged(asked.seed, range(asked.scenes), kinds, Engine(asked.model))
-    with click.progressbar(found, length=asked.scenes * len(kinds), file=sys.stderr) as bar:
-        print(table(list(bar)))
+    print_table(found, asked.scenes * len(kinds), table)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ def shares(points_mm: Points, line_mm: Points, near_mm: float) -> tuple[float, f
     return float(found.mean()), float(ours.mean())
 
 
-def head(first: str, near_mm: float) -> str:
-    """Head of the table, Markdown; ``first`` names the pictures."""
+def head(first: str, near_mm: float, counted: str = "pairs") -> str:
+    """Head of the table, Markdown; ``first`` names the pictures, ``counted`` what is counted."""
     names = (
-        first, "pairs", f"true line found within {near_mm:g} mm %", "ours that is true %",
+        first, counted, f"true line found within {near_mm:g} mm %", "ours that is true %",
         "F %, refused 0", "ok / degraded / refused", "least F of an ok %",
     )  # fmt: skip
     return f"| {' | '.join(names)} |\n" + "|---" * len(names) + "|"

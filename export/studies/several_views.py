@@ -12,11 +12,9 @@ within ``NEAR_MM``.
 
 from __future__ import annotations
 
-import argparse
-import sys
+import itertools
 from collections.abc import Iterator, Sequence
 
-import click
 import cv2
 import numpy as np
 
@@ -28,23 +26,22 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.prior import ANGLE_DEG, OFFSET_MM
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.tree.curves import resample
-from gcar_deploy.types import Image
+from gcar_deploy.types import Image, Pixels, Points
 from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import SyntheticTree, any_style, random_tree
+from gcar_export.studies.command import arguments, print_table
+from gcar_export.studies.hard_raw import NEAR_MM, SPREAD_DEG
 from gcar_export.studies.pair_rows import Judged, head, row, shares
 from gcar_export.studies.wrong_scenes import SIDES
 
 SEED = 28_110
-NEAR_MM = 1.5
-#: standard deviation of each angle of a view, deg
-SPREAD_DEG = 12.0
 #: a mask shows what is thicker than this, mm, and has so many bites of up to this radius, mm
 LEAST_MM, MOST_BITES, BITE_MM = (0.15, 0.6), 8, 2.5
-TOLD, MOVED, STRANGER = "as told", "moved", "last view of another patient"
-#: status, shares, and how far the true rays miss each other as told and as found, mm
+KINDS = "mask", "raw"
+TOLD, MOVED, STRANGER = ASKED = "as told", "moved", "last view of another patient"
+#: name of the row, what came out, how far true rays miss each other as told and as found, mm
 Row = tuple[str, Judged, float, float]
 
 
@@ -80,35 +77,35 @@ def scene(
     return pictures, seen, tree, grid
 
 
+def where(carms: Sequence[CArm], pixels: Sequence[Pixels]) -> tuple[Points, float]:
+    """(n, 3) where views see points, mm, and how far the rays miss them, RMS over all, mm."""
+    points, apart = triangulate(carms, pixels)
+    return points, float(np.sqrt(np.mean(apart**2)))
+
+
 def judged(seed: int, count: int) -> Iterator[Row]:
     """Yield a row for each scene of each kind."""
     engine = Engine()
-    for kind in ("mask", "raw"):
-        for asked in (TOLD, MOVED, STRANGER):
-            for number in range(count):
-                pictures, seen, tree, grid = scene(seed, number, kind, asked)
-                line = np.concatenate([resample(v.points_mm, 0.5) for v in tree.vessels])
-                pixels = [carm.project(line)[0] for carm in seen]
-
-                def apart(carms: Sequence[CArm], pixels: list[np.ndarray] = pixels) -> float:
-                    return float(np.sqrt(np.mean(triangulate(carms, pixels)[1] ** 2)))
-
-                told = [picture.carm for picture in pictures]
-                try:
-                    found = engine.reconstruct(pictures, grid)
-                except GcarError:
-                    yield f"{kind}, {asked}", (0.0, 0.0, "refused"), apart(told), np.nan
-                    continue
-                placed = [p.applied(c) for p, c in zip(found.poses, told, strict=True)]
-                # Nobody can say which view stands as told: the line is where the views see it.
-                there, _ = triangulate(placed, pixels)
-                ours = *shares(found.tree.points(), there, NEAR_MM), found.status
-                yield f"{kind}, {asked}", ours, apart(told), apart(placed)
+    for kind, asked, number in itertools.product(KINDS, ASKED, range(count)):
+        pictures, seen, tree, grid = scene(seed, number, kind, asked)
+        pixels = [carm.project(tree.line())[0] for carm in seen]
+        told = [picture.carm for picture in pictures]
+        _, before = where(told, pixels)
+        try:
+            found = engine.reconstruct(pictures, grid)
+        except GcarError:
+            yield f"{kind}, {asked}", (0.0, 0.0, "refused"), before, np.nan
+            continue
+        placed = [p.applied(c) for p, c in zip(found.poses, told, strict=True)]
+        # Nobody can say which view stands as told: the line is where the views see it.
+        there, after = where(placed, pixels)
+        ours = *shares(found.tree.points(), there, NEAR_MM), found.status
+        yield f"{kind}, {asked}", ours, before, after
 
 
 def table(rows: Sequence[Row]) -> str:
     """Markdown: a line per kind of scene, and how far the views stand from each other."""
-    out = [head("views", NEAR_MM).replace("pairs", "scenes")]
+    out = [head("views", NEAR_MM, "scenes")]
     names = dict.fromkeys(name for name, *_ in rows)
     for name in names:
         own = [one for label, one, *_ in rows if label == name]
@@ -126,13 +123,9 @@ def table(rows: Sequence[Row]) -> str:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=SEED)
-    asked = parser.parse_args()
-    found = judged(asked.seed, asked.scenes)
-    with click.progressbar(found, length=6 * asked.scenes, file=sys.stderr) as bar:
-        print(table(list(bar)))
+    asked = arguments(__doc__, "--scenes", 12, SEED).parse_args()
+    count = len(KINDS) * len(ASKED) * asked.scenes
+    print_table(judged(asked.seed, asked.scenes), count, table)
 
 
 if __name__ == "__main__":

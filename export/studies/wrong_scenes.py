@@ -30,7 +30,6 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import triangulate
 from gcar_deploy.geometry.scene import Intensity, Scene, View
-from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Pixels, Points
 from gcar_export.scenes.protocols import MASK_PATH_MM, MM_PER_COUNT, clinical_geometry
 from gcar_export.scenes.raw_pictures import RawOptions, raw_picture
@@ -144,7 +143,7 @@ def exam(seed: int, number: int, pictures: str, views: int) -> Exam:
     images = tuple(picture_of(path_lengths(c, *tree.segments()), pictures, rng) for c in carms)
     return Exam(
         name=f"{seed}/{number} {side}", pictures=pictures, tree=tree, other=other,
-        line_mm=np.concatenate([resample(v.points_mm, 0.5) for v in tree.vessels]),
+        line_mm=tree.line(),
         told=Told(carms=carms, images=images, moves=(_stays,) * views), rng=rng,
     )  # fmt: skip
 
