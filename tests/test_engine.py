@@ -7,6 +7,7 @@ import dataclasses
 import json
 import threading
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -16,6 +17,7 @@ from gcar_deploy.config import PredictOptions
 from gcar_deploy.errors import CancelledError, GeometryError, ImageError, ModelError, UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.selftest import tiny_case
+from tests.conftest import ready_case
 
 HULL = RunOptions(predict=PredictOptions(predictor="none"))
 
@@ -80,6 +82,21 @@ def test_eight_threads_share_the_shipped_model_to_the_byte(case, request):
     with concurrent.futures.ThreadPoolExecutor(8) as pool:
         runs = [pool.submit(engine.reconstruct, angiograms, grid) for _ in range(8 * calls)]
         assert {content(run.result()) for run in runs} == {alone}
+
+
+@pytest.mark.slow
+def test_a_busy_pool_of_opencv_changes_no_byte():
+    """OpenCV's threads are the process's: while others use them, a call has one."""
+    folder = ready_case("R_0001")
+    views, before = (folder / "view1.png", folder / "view2.png"), cv2.getNumThreads()
+    engine, found = Engine(threads=1), set()
+    try:
+        for threads in (1, 2, 5):
+            cv2.setNumThreads(threads)
+            found.add(content(engine.reconstruct(views, folder / "geom.json")))
+    finally:
+        cv2.setNumThreads(before)
+    assert len(found) == 1
 
 
 def test_an_existing_session_is_used_as_it_is(case):

@@ -14,6 +14,7 @@ import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.border import inward_px
+from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.imaging.resample import blocks
 from gcar_deploy.imaging.segment import PART_SHARE
 from gcar_deploy.types import Array, Image, Mask
@@ -180,7 +181,7 @@ def _of_rise(rise: Image, holes: Mask, levels: tuple[float, float]) -> tuple[Mas
         return None
     reach = rise > floor
     line = skel.skeletonize(reach)
-    wide = skel.to_rim(reach).max() > _HALF_WIDTH * min(rise.shape)
+    wide = exact_distance(reach).max() > _HALF_WIDTH * min(rise.shape)
     if not line.any() or reach.mean() > _AREA or wide:
         return None
     kept = skel.strong_parts(_on_ground(line, reach, rise), rise, PART_SHARE)

@@ -20,6 +20,7 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
 from gcar_deploy.imaging.device_lines import device_map, device_parts
+from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.imaging.net import (
     NOMINAL_MM,
     SIDE,
@@ -141,7 +142,7 @@ def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -
     pixel_mm = NOMINAL_MM / finer
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / pixel_mm)
     sigma_px = enhance.ridges(flat, pixel_mm).sigma_px
-    half = skel.to_rim(reach)
+    half = exact_distance(reach)
     found = np.zeros_like(reach)
     course = catheters(line, flat, sigma_px, ~holes, pixel_mm)
     for part in (course, *device_parts(line, told, DEVICE_LEVEL, finer)):

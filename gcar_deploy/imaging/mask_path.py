@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.types import Image, Mask
 
 #: the edge is drawn between pixels: so many parts of a pixel ...
@@ -69,7 +70,7 @@ def _chords(box: Mask, parts: int) -> Image:
     if not line.any():
         return np.zeros(box.shape, np.float32)
     # to the centre of the first pixel outside, half a pixel too far
-    edge = skel.to_rim(vessel) - 0.5
+    edge = exact_distance(vessel) - 0.5
     distance, radius = skel.averaged(line, vessel, edge, ALONG_SIGMA_PX * parts)
     # In a fork the nearest line may be that of the thinner vessel.
     radius = np.maximum(radius, edge)

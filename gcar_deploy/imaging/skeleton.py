@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.types import Array, Image, Mask, Scalars
 
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
@@ -193,7 +194,7 @@ def inscribed(reach: Mask, line: Mask) -> Mask:
 
     A vessel seen end-on is a disc at the end of its line: nothing of it is a branch.
     """
-    half = to_rim(reach)
+    half = exact_distance(reach)
     out = np.zeros(reach.shape, np.uint8)
     for row, col in np.argwhere(line & reach).tolist():
         cv2.circle(out, (col, row), int(half[row, col]), 1, -1)
@@ -220,12 +221,6 @@ def mostly(line: Mask, inside: Mask) -> Mask:
         for own in (line, line & inside)
     )
     return line & (share > 0.5 * count)
-
-
-def to_rim(mask: Mask) -> Image:
-    """(rows, cols) distance to the nearest pixel outside, pixels: on its line, half the width."""
-    away = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(away, dtype=np.float32)
 
 
 def to_line(skeleton: Mask) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.device_lines import device_parts
+from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
 from gcar_deploy.imaging.net import SIDE, network_scale
 from gcar_deploy.types import Mask
@@ -78,7 +79,7 @@ def _fills(view: VesselImage, graph: LineGraph, end: Pixel, px: float) -> bool:
     before = before[np.hypot(*(before - end).T) <= last]
     if len(path) <= first or not len(before):
         return False
-    half = skel.to_rim(whole.mask)
+    half = exact_distance(whole.mask)
     own, device = (float(np.median(half[tuple(np.transpose(p))])) for p in (path[first:], before))
     return own >= WIDER * device
 

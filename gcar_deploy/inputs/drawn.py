@@ -168,6 +168,8 @@ def _brush(canvas: Array, points: tuple[Place, ...], width: float, value: int) -
     import cv2
     import numpy as np
 
+    from gcar_deploy.imaging.distance import exact_distance
+
     whole = np.array(points)
     reach = int(np.ceil(width / 2)) + 2
     # Only what lies near the picture is drawn, however far the line leads.
@@ -180,7 +182,7 @@ def _brush(canvas: Array, points: tuple[Place, ...], width: float, value: int) -
     # One point alone is a dot, which polylines leaves out.
     line = np.repeat(line, 2, axis=0) if len(line) == 1 else line
     cv2.polylines(room, [line], False, 0, 1, cv2.LINE_8, _SHIFT)
-    near = cv2.distanceTransform(room, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= width / 2
+    near = exact_distance(room > 0) <= width / 2
     at = np.argwhere(near) + low[::-1]
     at = at[((at >= 0) & (at < canvas.shape)).all(axis=1)]
     canvas[at[:, 0], at[:, 1]] = value

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.types import Array, Mask
 
 
@@ -20,11 +20,11 @@ def distance_mm(view: VesselImage, points_mm: Array, marked: Mask, *, beyond: bo
     beyond : whether all beyond the picture is marked as well; else points there are at infinity,
         as all are where nothing is marked
     """
-    free = np.pad(~marked, 1, constant_values=not beyond).astype(np.uint8)
+    free = np.pad(~marked, 1, constant_values=not beyond)
     outside = 0.0 if beyond else np.inf
     if free.all():
         return np.full(len(points_mm), outside)
-    away = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    away = exact_distance(free)
     pixels = np.rint(np.nan_to_num(view.carm.project(points_mm)[0], nan=-9.0)).astype(np.int64) + 1
     column, row = pixels[:, 0], pixels[:, 1]
     rows, columns = free.shape
