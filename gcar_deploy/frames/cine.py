@@ -72,8 +72,13 @@ def is_cine(path: str | Path) -> bool:
     return Path(path).is_dir() or is_stack(path)
 
 
-def open_cine(path: str | Path, options: RunOptions) -> Cine | None:
+def open_cine(path: str | Path, options: RunOptions, *, subtracted: bool = False) -> Cine | None:
     """Open a run; None for a single picture.
+
+    Parameters
+    ----------
+    path : of a file or a folder of pictures
+    subtracted : as ``imaging.read.read_picture``
 
     Raises
     ------
@@ -81,10 +86,10 @@ def open_cine(path: str | Path, options: RunOptions) -> Cine | None:
     """
     path = Path(path)
     if path.is_dir():
-        return _of_folder(path, options)
+        return _of_folder(path, options, subtracted)
     if is_dicom(path):
         return _of_dicom(path, options)
-    return _of_stack(path, options) if is_stack(path) else None
+    return _of_stack(path, options, subtracted) if is_stack(path) else None
 
 
 def _of_dicom(path: Path, options: RunOptions) -> Cine | None:
@@ -105,7 +110,7 @@ def _of_dicom(path: Path, options: RunOptions) -> Cine | None:
     return Cine(name=path.name, count=header.frames, read=read, valid=valid, header=header)
 
 
-def _of_folder(path: Path, options: RunOptions) -> Cine:
+def _of_folder(path: Path, options: RunOptions, subtracted: bool) -> Cine:
     """Open the pictures of a folder in the order of the numbers in their names."""
     try:
         files = [p for p in path.iterdir() if not p.name.startswith(".")]
@@ -122,11 +127,12 @@ def _of_folder(path: Path, options: RunOptions) -> Cine:
             f"{path.name}: the folder holds {len(pictures)} pictures; at most "
             f"{limits.max_frames} frames are read"
         )
-    first, depth, _ = read_picture(pictures[0], options.imaging.limits)
+    take = functools.partial(read_picture, limits=options.imaging.limits, subtracted=subtracted)
+    first, depth, _ = take(pictures[0])
 
     @functools.lru_cache(maxsize=2)
     def read(index: int) -> tuple[Image, int, str]:
-        picture, own, sha256 = read_picture(pictures[index], options.imaging.limits)
+        picture, own, sha256 = take(pictures[index])
         if picture.shape != first.shape or own != depth:
             raise ImageError(
                 f"{path.name}: {pictures[index].name} has {picture.shape} (rows, columns) of "
@@ -138,8 +144,8 @@ def _of_folder(path: Path, options: RunOptions) -> Cine:
     return Cine(name=path.name, count=len(pictures), read=read)
 
 
-def _of_stack(path: Path, options: RunOptions) -> Cine:
-    pages, depth, sha256 = read_stack(path, options.dicom.limits)
+def _of_stack(path: Path, options: RunOptions, subtracted: bool) -> Cine:
+    pages, depth, sha256 = read_stack(path, options.dicom.limits, subtracted=subtracted)
     return Cine(name=path.name, count=len(pages), read=lambda k: (pages[k], depth, sha256))
 
 

@@ -163,10 +163,11 @@ def _contrast(
 
 def _bright(stack: Array, carm: CArm, intensity: Intensity) -> tuple[Array, Mask]:
     """Frames with bright vessels in which paths about add up, and where nothing is shown."""
-    # A frame without contrast tells nothing of how vessels look: the one that tells most is asked.
-    some = stack[:: max(1, len(stack) // _ASKED)]
-    mm = carm.pixel_at_isocenter_mm
-    told = max(some, key=lambda one: abs(enhance.darkness(one, mm)))
+    told, mm = stack[0], carm.pixel_at_isocenter_mm
+    if intensity.polarity == "auto":
+        # A frame without contrast tells nothing of how vessels look: the one that tells most does.
+        some = stack[:: max(1, len(stack) // _ASKED)]
+        told = max(some, key=lambda one: abs(enhance.darkness(one, mm)))
     dark = is_dark(
         Angiogram(view_id="", carm=carm, pixels=told, bit_depth=8, intensity=intensity, sha256="")
     )

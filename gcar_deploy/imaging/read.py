@@ -81,12 +81,15 @@ def is_stack(path: str | Path) -> bool:
     return _sniff(data) == "TIFF" and png_guard.has_pages(data)
 
 
-def read_stack(path: str | Path, limits: DicomLimits) -> tuple[list[Image], int, str]:
+def read_stack(
+    path: str | Path, limits: DicomLimits, *, subtracted: bool = False
+) -> tuple[list[Image], int, str]:
     """Read the pages of a TIFF, the frames of a run; see ``read_picture``.
 
     Parameters
     ----------
     limits : DicomLimits, what a run may be
+    subtracted : as ``read_picture``
 
     Returns
     -------
@@ -112,6 +115,7 @@ def read_stack(path: str | Path, limits: DicomLimits) -> tuple[list[Image], int,
         if not done or len(pages) != count or any(p.dtype != _TYPE_OF[depth] for p in pages):
             raise ValueError("cannot be decoded (damaged or unusual); export its frames as PNG")
         grey = [_one_channel(page) for page in pages]
+        grey = [from_zero(page) for page in grey] if subtracted else grey
         for page in grey:
             if page.shape != (rows, columns):
                 raise ValueError("holds pages of several sizes")

@@ -168,7 +168,7 @@ def _by_scene(
             f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
         )
     angiograms = []
-    runs = find_runs(views, options)
+    runs = find_runs(views, options, scene)
     notes = [*scene.warnings, *_unused(options.dicom, any_run=bool(runs.wanted))]
     seen = seen_runs(runs, scene, options)
     chosen = together(runs, seen)

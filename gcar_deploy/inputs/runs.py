@@ -60,8 +60,14 @@ class Runs:
         return (*cine.read(frame.number - 1), frame)
 
 
-def find_runs(views: Sequence[Any], options: RunOptions) -> Runs:
+def find_runs(views: Sequence[Any], options: RunOptions, scene: Scene | None = None) -> Runs:
     """Find the runs among the views, and what is asked of them.
+
+    Parameters
+    ----------
+    views : files, or pictures in memory
+    options : RunOptions
+    scene : what the views' counts mean, a view each; None where headers tell it
 
     Raises
     ------
@@ -70,7 +76,8 @@ def find_runs(views: Sequence[Any], options: RunOptions) -> Runs:
     files = {k: view for k, view in enumerate(views, start=1) if isinstance(view, (str, Path))}
     runs = [k for k, path in files.items() if is_dicom(path) or is_cine(path)]
     wanted = dict(zip(runs, wanted_frames(options.dicom, len(runs)), strict=True)) if runs else {}
-    opened = {k: open_cine(files[k], options) for k in runs}
+    subtracted = [k for k in runs if scene is not None and scene.views[k - 1].intensity.subtracted]
+    opened = {k: open_cine(files[k], options, subtracted=k in subtracted) for k in runs}
     return Runs(cines={k: c for k, c in opened.items() if c is not None}, wanted=wanted)
 
 
@@ -138,7 +145,7 @@ def compared(
     GeometryError
         A C-arm is not known, or moved during its run.
     """
-    runs = find_runs(views, options)
+    runs = find_runs(views, options, geometry)
     for k, view in enumerate(views, start=1):
         if k not in runs.cines:
             raise UsageError(f"{Path(view).name} is no run of several frames")

@@ -239,4 +239,4 @@ _READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm"
 
 @functools.lru_cache(maxsize=8)
 def _frames(path: Path) -> Cine | None:
-    return open_cine(path, RunOptions())
+    return open_cine(path, RunOptions(), subtracted=True)

@@ -18,6 +18,7 @@ from gcar_deploy.frames.cine import is_cine, open_cine
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.imaging.frame import ChosenFrame, FramePair
 from gcar_deploy.inputs.pictures import prepare
+from gcar_deploy.inputs.runs import find_runs
 from gcar_deploy.quality import check_views
 from gcar_export.scenes.cine import cine_pair
 from gcar_export.studies.frame_pairs import CHOSEN_ON
@@ -80,6 +81,26 @@ def test_bad_runs_are_refused_in_one_line(tmp_path):
     few = RunOptions(dicom=DicomOptions(limits=DicomLimits(max_frames=3)))
     with pytest.raises(ImageError, match="more than 3 pages"):
         open_cine(tmp_path / "many.tif", few)
+
+
+@pytest.mark.parametrize("name", ["run", "run.tif"])
+@pytest.mark.parametrize("kind", ["attenuation", "raw"])
+def test_noise_below_zero_of_subtracted_frames(made, tmp_path, kind, name):
+    """What subtraction leaves lies about 0; counts of a detector do not."""
+    frames = np.random.default_rng(3).normal(size=(3, 48, 48)).astype("f4")
+    frames[1, 20:28] += 40
+    (tmp_path / "run").mkdir()
+    for k, frame in enumerate(frames):
+        np.save(tmp_path / "run" / f"{k}.npy", frame)
+    tifffile.imwrite(tmp_path / "run.tif", frames, photometric="minisblack")
+    view = View(id="1", carm=made.runs[0].carm.resized(48, 48), intensity=Intensity(kind=kind))
+    views, scene = [tmp_path / name] * 2, Scene(views=(view, dataclasses.replace(view, id="2")))
+    if kind == "raw":
+        with pytest.raises(ImageError, match="negative"):
+            find_runs(views, OPTIONS, scene).cines[1].decode(1)
+        return
+    cine = find_runs(views, OPTIONS, scene).cines[1]
+    np.testing.assert_array_equal(cine.decode(1), np.maximum(frames[1], 0))
 
 
 def test_pages_that_run_in_a_circle_end(tmp_path):
