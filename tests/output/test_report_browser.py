@@ -59,6 +59,19 @@ def colors(page, selector):
     return {tuple(map(int, c.split(","))) for c in page.eval_on_selector(selector, script)}
 
 
+def opaque(page, selector, places):
+    """Whether a canvas is drawn on at all these (x, y), CSS pixels from its corner."""
+    script = """(canvas, places) => {
+      const copy = document.createElement("canvas"), ratio = canvas.width / canvas.clientWidth;
+      copy.width = canvas.width; copy.height = canvas.height;
+      const context = copy.getContext("2d", { willReadFrequently: true });
+      context.drawImage(canvas, 0, 0);
+      return places.every(([x, y]) =>
+        context.getImageData(Math.floor(x * ratio), Math.floor(y * ratio), 1, 1).data[3] > 0);
+    }"""
+    return page.eval_on_selector(selector, script, places)
+
+
 @pytest.mark.slow
 def test_its_own_policy_blocks_nothing(opened):
     assert angle(opened()) == "RAO 30 CAU 20"
@@ -147,6 +160,38 @@ def test_the_tree_lies_on_the_vessels_of_each_picture(opened):
         assert any(g > 150 and g > 1.5 * r for r, g, _ in found)
     page.select_option("#linecolor", "none")
     assert colors(page, ".lines[data-view='0']") == set()
+
+
+@pytest.mark.slow
+def test_pictures_are_shown_around_the_tree(opened, result):
+    """A click on a vessel of the enlarged picture chooses its branch."""
+    page = opened()
+    page.select_option("#crop", "tree")
+    for k, view in enumerate(result.views):
+        picture, stage = page.locator("figure img").nth(k), page.locator("figure .stage").nth(k)
+        stage.scroll_into_view_if_needed()
+        whole, shown = picture.bounding_box(), stage.bounding_box()
+        assert 1.05 < whole["width"] / shown["width"] <= 4
+        size = np.array([view.carm.columns, view.carm.rows])
+        lines = [
+            (view.carm.project(b.points_mm)[0] + 0.5) / size * [whole["width"], whole["height"]]
+            for b in result.tree.branches
+        ]
+        corner = np.array([whole["x"] - shown["x"], whole["y"] - shown["y"]])
+        middles = np.array([line[len(line) // 2] for line in lines]) + corner
+        assert opaque(page, f".lines[data-view='{k}']", middles.tolist())
+        for line in lines:
+            end = line[-1] + corner
+            assert (end > 0).all() and (end < [shown["width"], shown["height"]]).all()
+        # The longest is chosen from the beginning.
+        _, second = sorted(range(len(lines)), key=lambda n: result.tree.branches[n].length_mm)[
+            :-3:-1
+        ]
+        page.mouse.click(*(middles[second] + [shown["x"], shown["y"]]))
+        chosen = page.locator("#branches tr.chosen").get_attribute("data-branch")
+        assert chosen == str(second + 1)
+    page.select_option("#crop", "whole")
+    assert page.locator("figure img").first.bounding_box()["width"] <= shown["width"] + 1
 
 
 @pytest.mark.slow
