@@ -69,6 +69,19 @@ def test_a_catheter_that_the_network_knows_leaves_the_classical_path():
     assert (both.path_mm[vessel & away] > 0).all()
 
 
+@pytest.mark.parametrize(("chance", "stays"), [(0.0, False), (0.3, True)])
+def test_a_line_that_is_none_for_the_network_is_another_reading(chance, stays):
+    """It ends where a vessel begins, whose probability says nothing of it."""
+    edge, vessel = drawn(((5, 100), (55, 100))), drawn(VESSEL)
+    probability = np.where(vessel, 0.9, np.where(edge, chance, 0)).astype(np.float32)
+    both = fused(
+        seen(edge | vessel), dataclasses.replace(seen(vessel), vesselness=probability),
+        picture(edge, vessel),
+    )  # fmt: skip
+    assert (both.path_mm[100, 10:50] > 0).all() == stays == (both.path_mm[100, 10:50] > 0).any()
+    assert (both.path_mm[50:115, 60] > 0).all() and both.others[1].mask[100, 30]
+
+
 def test_what_either_takes_for_a_device_is_remembered():
     shaft, vessel = drawn(SHAFT), drawn(VESSEL)
     none = np.zeros_like(shaft)
