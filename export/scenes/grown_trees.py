@@ -106,11 +106,10 @@ def _runs(parent: Array, flow: Scalars) -> list[list[int]]:
 
 
 def _winding(rng: np.random.Generator) -> Array:
-    """(4, 3, 6) amplitudes, mm, frequencies, 1/mm, phases, and axes of the waves of a tree."""
+    """(3, 3, 6) amplitudes, mm, frequencies, 1/mm, and phases of the waves of a tree."""
     size = (3, 6)
     amplitude = np.full(size, rng.uniform(0.1, 0.7))
-    axis = np.tile(np.arange(6) % 3, (3, 1)).astype(np.float64)
-    return np.stack([amplitude, rng.uniform(0.1, 0.6, size), rng.uniform(0, 6.28, size), axis])
+    return np.stack([amplitude, rng.uniform(0.1, 0.6, size), rng.uniform(0, 6.28, size)])
 
 
 def _vessel(
@@ -122,8 +121,9 @@ def _vessel(
     line = CubicSpline(arc, nodes)(at) if len(nodes) > 2 else nodes[0] + np.outer(
         at / arc[-1], nodes[1] - nodes[0]
     )  # fmt: skip
-    amplitude, frequency, phase, axis = wind
-    waves = amplitude * np.sin(frequency * line[:, axis.astype(int)] + phase)
+    amplitude, frequency, phase = wind
+    # Six waves each way, two along each axis.
+    waves = amplitude * np.sin(frequency * np.tile(line, 2)[:, None] + phase)
     # A side branch begins as wide as it goes on.
     wide = np.interp(at, arc, np.concatenate([[min(radius[0], 1.15 * radius[1])], radius[1:]]))
     wide = gaussian_filter1d(wide, 6, mode="nearest") * np.linspace(1.1, 0.85, len(at))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from scipy.special import expit
 
 from gcar_deploy.types import Array, Image
 
@@ -31,12 +32,12 @@ def thorax(shape: tuple[int, int], pixel_mm: float, rng: np.random.Generator) ->
         slope, bow = rng.uniform(-0.6, 0.6), 0.0015 * (x - 80) ** 2
         for k in range(-3, 9):
             off = y - k * rng.uniform(18, 24) - rng.uniform(-3, 3) - slope * x - bow
-            out += _step(rng.uniform(4, 6) - np.abs(off), 0.7) * rng.uniform(0.03, 0.12)
+            out += expit((rng.uniform(4, 6) - np.abs(off)) / 0.7) * rng.uniform(0.03, 0.12)
     if rng.random() < 0.6:
-        out += _step(16 - np.abs(x - rng.uniform(0, wide) + 0.1 * y), 2) * rng.uniform(0.1, 0.4)
+        out += expit((16 - np.abs(x - rng.uniform(0, wide) + 0.1 * y)) / 2) * rng.uniform(0.1, 0.4)
     if rng.random() < 0.5:
         dome = high * rng.uniform(0.7, 1.1) + 0.002 * (x - rng.uniform(20, 120)) ** 2
-        out += _step(y - dome, rng.uniform(0.8, 3)) * rng.uniform(0.2, 0.6)
+        out += expit((y - dome) / rng.uniform(0.8, 3)) * rng.uniform(0.2, 0.6)
     return out
 
 
@@ -69,9 +70,9 @@ def exposure(
     if rng.random() < 0.4:
         edge = int(min(shape) * rng.uniform(0, 0.04))
         counts[:edge], counts[:, :edge] = 0, 0
-        y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
-        away = np.hypot(y - shape[0] / 2, x - shape[1] / 2)
         if rng.random() < 0.5:
+            y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
+            away = np.hypot(y - shape[0] / 2, x - shape[1] / 2)
             counts[away > 0.5 * max(shape) * rng.uniform(1, 1.15)] = 0
     return np.asarray(counts, dtype=np.float32)
 
@@ -86,9 +87,3 @@ def _displayed(light: Array, pixel_mm: float, rng: np.random.Generator) -> Array
         smooth = cv2.GaussianBlur(shown, (0, 0), rng.uniform(1, 4) / pixel_mm)
         shown = shown + rng.uniform(0.5, 2) * (shown - smooth)
     return shown
-
-
-def _step(off: Array, soft_mm: float) -> Array:
-    """Share of an edge that is passed: 0 far below 0, 1 far above."""
-    out: Array = 1 / (1 + np.exp(np.clip(-off / soft_mm, -60, 60)))
-    return out

@@ -31,7 +31,7 @@ from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Points
 from gcar_export.scenes.cine import CinePair, CineRun, cine_pair
 from gcar_export.studies.command import arguments, print_table
-from gcar_export.studies.pair_rows import Judged, head, row
+from gcar_export.studies.pair_rows import Judged, table_by_name
 
 SEED, FRAMES = 7_400, 8
 NEAR_MM = 2.0
@@ -137,9 +137,7 @@ def judged(seed: int, patients: int, wait: int = 0) -> Iterator[tuple[str, *Judg
 
 def table(rows: Sequence[tuple[str, *Judged]]) -> str:
     """Markdown: one line for each kind of picture."""
-    kinds = dict.fromkeys(own[0] for own in rows)
-    out = [row(name, [own[1:] for own in rows if own[0] == name]) for name in kinds]
-    return "\n".join([head("pictures", NEAR_MM), *out])
+    return table_by_name(rows, "pictures", NEAR_MM)
 
 
 def main() -> None:

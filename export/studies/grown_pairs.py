@@ -15,8 +15,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import GcarError
-from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.scene import Intensity, default_grid
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Image, Points
@@ -25,7 +24,7 @@ from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.thorax import exposure
 from gcar_export.scenes.trees import SyntheticTree
 from gcar_export.studies.command import arguments, print_table
-from gcar_export.studies.pair_rows import Judged, head, row, shares
+from gcar_export.studies.pair_rows import Judged, judge, table_by_name
 
 SEED, NEAR_MM = 28_111, 1.5
 KINDS = "path_length", "mask", "raw"
@@ -47,8 +46,8 @@ def carms(rng: np.random.Generator) -> list[CArm]:
             sod_mm=sod, sdd_mm=sdd, rows=side, columns=side, pixel_spacing_mm=(pitch, pitch),
             detector_rotation_deg=float(rng.choice([0, 0, rng.uniform(-15, 15)])),
         )  # fmt: skip
-        angle = [np.degrees(np.arccos(own.axes[2] @ other.axes[2])) for other in out]
-        if all(_BETWEEN_DEG[0] < a < _BETWEEN_DEG[1] for a in angle):
+        least, most = _BETWEEN_DEG
+        if all(least < separation_deg(own, other) < most for other in out):
             out.append(own)
     return out
 
@@ -106,20 +105,13 @@ def judged(seed: int, pairs: int) -> Iterator[tuple[str, *Judged]]:
     for number in range(pairs):
         for kind in KINDS:
             views, line = pair(seed, number, kind)
-            try:
-                result = engine.reconstruct(views, default_grid([view.carm for view in views]))
-            except GcarError:
-                yield kind, 0.0, 0.0, "refused"
-                continue
-            yield kind, *shares(result.tree.points(), line, NEAR_MM), result.status
+            grid = default_grid([view.carm for view in views])
+            yield kind, *judge(engine, views, grid, line, NEAR_MM)
 
 
 def table(rows: Sequence[tuple[str, *Judged]]) -> str:
     """Markdown: one line a kind of picture."""
-    out = [head("pictures", NEAR_MM)]
-    for kind in dict.fromkeys(own[0] for own in rows):
-        out.append(row(kind, [own[1:] for own in rows if own[0] == kind]))
-    return "\n".join(out)
+    return table_by_name(rows, "pictures", NEAR_MM)
 
 
 def main() -> None:

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
@@ -26,7 +25,7 @@ from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import any_style, random_tree
 from gcar_export.studies.command import arguments, print_table
-from gcar_export.studies.pair_rows import Judged, head, row, shares
+from gcar_export.studies.pair_rows import Judged, judge, table_by_name
 from gcar_export.studies.wrong_scenes import SIDES
 
 SEED = 81_030
@@ -73,20 +72,13 @@ def judged(seed: int, pairs: int) -> Iterator[tuple[str, *Judged]]:
         stranger = raw_pair(seed, number + OTHER).angiograms[1]
         asked = ((ONE, pair.angiograms[1]), (TWO, stranger))
         for name, second in asked:
-            try:
-                result = engine.reconstruct([pair.angiograms[0], second], pair.grid)
-            except GcarError:
-                yield name, 0.0, 0.0, "refused"
-                continue
-            yield name, *shares(result.tree.points(), pair.line_mm, NEAR_MM), result.status
+            views = [pair.angiograms[0], second]
+            yield name, *judge(engine, views, pair.grid, pair.line_mm, NEAR_MM)
 
 
 def table(rows: Sequence[tuple[str, *Judged]]) -> str:
     """Markdown: one line per kind of pair."""
-    out = [head("pictures of", NEAR_MM)]
-    for name in dict.fromkeys(own[0] for own in rows):
-        out.append(row(name, [own[1:] for own in rows if own[0] == name], known=name == ONE))
-    return "\n".join(out)
+    return table_by_name(rows, "pictures of", NEAR_MM, unknown=(TWO,))
 
 
 def main() -> None:

@@ -15,13 +15,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Array
 from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
 from gcar_export.studies.command import print_table
-from gcar_export.studies.pair_rows import shares
+from gcar_export.studies.pair_rows import judge
 from gcar_export.studies.wrong_scenes import Exam, exam
 
 SEED = 31_007
@@ -101,12 +100,8 @@ def judged(pairs: int) -> Iterator[tuple[str, float, float, str]]:
     for number in range(pairs):
         case = exam(SEED, number, "path_length", 2)
         for name, look in LOOKS.items():
-            try:
-                result = engine.reconstruct(pictures(case, look, number), grid)
-            except GcarError:
-                yield name, 0.0, 0.0, "refused"
-                continue
-            yield name, *shares(result.tree.points(), case.line_mm, NEAR_MM), result.status
+            views = pictures(case, look, number)
+            yield name, *judge(engine, views, grid, case.line_mm, NEAR_MM)
 
 
 def table(rows: list[tuple[str, float, float, str]]) -> str:

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
@@ -28,7 +27,7 @@ from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.shapes import SHAPES, shape
 from gcar_export.studies.command import arguments, print_table
-from gcar_export.studies.pair_rows import Judged, head, row, shares
+from gcar_export.studies.pair_rows import Judged, head, judge, row
 
 SEED = 5
 NEAR_MM = 1.5
@@ -102,13 +101,8 @@ def judged(
     for number in numbers:
         of = scene(seed, number)
         for kind in kinds:
-            try:
-                result = engine.reconstruct(pictures(of, kind, seed, number), GRID)
-            except GcarError:
-                yield kind, of.name, 0.0, 0.0, "refused"
-                continue
-            near = shares(result.tree.points(), of.line_mm, NEAR_MM)
-            yield kind, of.name, *near, result.status
+            views = pictures(of, kind, seed, number)
+            yield kind, of.name, *judge(engine, views, GRID, of.line_mm, NEAR_MM)
 
 
 def table(rows: Sequence[tuple[str, str, *Judged]]) -> str:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gcar_deploy.engine import Engine
+from gcar_deploy.errors import GcarError
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Points
 
 #: share of the true line found, share of ours that is true, status (``refused``: both 0)
@@ -18,6 +22,17 @@ def shares(points_mm: Points, line_mm: Points, near_mm: float) -> tuple[float, f
     found = cKDTree(points_mm).query(line_mm)[0] <= near_mm
     ours = cKDTree(line_mm).query(points_mm)[0] <= near_mm
     return float(found.mean()), float(ours.mean())
+
+
+def judge(
+    engine: Engine, views: Sequence[Angiogram], grid: Grid, line_mm: Points, near_mm: float
+) -> Judged:
+    """Reconstruct a scene and hold it against (m, 3) points of its true line, mm."""
+    try:
+        found = engine.reconstruct(views, grid)
+    except GcarError:
+        return 0.0, 0.0, "refused"
+    return *shares(found.tree.points(), line_mm, near_mm), found.status
 
 
 def head(first: str, near_mm: float, counted: str = "pairs") -> str:
@@ -46,3 +61,14 @@ def row(name: str, judged: Sequence[Judged], *, known: bool = True) -> str:
     sure = [f for f, status in zip(both, states, strict=True) if status == "ok"]
     least = f"{min(sure):.1f}" if sure else "-"
     return f"| {name} | {len(judged)} | {' | '.join(figures)} | {counts} | {least} |"
+
+
+def table_by_name(
+    rows: Sequence[tuple[str, *Judged]], first: str, near_mm: float, unknown: Container[str] = ()
+) -> str:
+    """Table with a line for each name that rows begin with; of ``unknown`` ones statuses alone."""
+    out = [head(first, near_mm)]
+    for name in dict.fromkeys(own[0] for own in rows):
+        judged = [own[1:] for own in rows if own[0] == name]
+        out.append(row(name, judged, known=name not in unknown))
+    return "\n".join(out)

@@ -74,7 +74,8 @@ def _both(classic: VesselImage, learned: VesselImage, picture: Image) -> VesselI
 
 def _likely(classic: VesselImage, learned: VesselImage) -> Mask:
     """Where the classical method sees vessel, without lines that are none for the network."""
-    reach, line = classic.path_mm > 0, skel.skeletonize(classic.path_mm > 0)
+    reach = classic.path_mm > 0
+    line = skel.skeletonize(reach)
     alone = line & (cv2.dilate((learned.path_mm > 0).astype(np.uint8), _NEAR) == 0)
     seen = learned.vesselness
     if seen is None or not alone.any():

@@ -76,8 +76,13 @@ def find_runs(views: Sequence[Any], options: RunOptions, scene: Scene | None = N
     files = {k: view for k, view in enumerate(views, start=1) if isinstance(view, (str, Path))}
     runs = [k for k, path in files.items() if is_dicom(path) or is_cine(path)]
     wanted = dict(zip(runs, wanted_frames(options.dicom, len(runs)), strict=True)) if runs else {}
-    subtracted = [k for k in runs if scene is not None and scene.views[k - 1].intensity.subtracted]
-    opened = {k: open_cine(files[k], options, subtracted=k in subtracted) for k in runs}
+    opened = {
+        k: open_cine(
+            files[k], options,
+            subtracted=scene is not None and scene.views[k - 1].intensity.subtracted,
+        )
+        for k in runs
+    }  # fmt: skip
     return Runs(cines={k: c for k, c in opened.items() if c is not None}, wanted=wanted)
 
 

@@ -239,4 +239,5 @@ _READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm"
 
 @functools.lru_cache(maxsize=8)
 def _frames(path: Path) -> Cine | None:
+    # Frames are only looked at here: a run of the case says whether numbers below 0 are noise.
     return open_cine(path, RunOptions(), subtracted=True)
