@@ -14,8 +14,8 @@ from gcar_deploy.imaging.one_sided import one_sided
 from gcar_deploy.types import Image, Mask
 
 #: a line of the classical method's alone is one where the network finds it as probable as this, in
-#: the mean and in the middle. Of 1.8 m of such lines below (pairs of the studies ``hard_raw`` and
-#: ``cath_lab_pairs``) 1 % lay on vessels; the rest were edges of ribs and clouds
+#: the mean and in the middle: others are edges of ribs and clouds but for one in a hundred or so.
+#: Chosen on generated raw pairs of three simulators
 _LEAST_MEAN, _LEAST_MEDIAN = 0.1, 0.02
 #: a line of the network's is on a device that lies so near, pixels each way
 _NEAR = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
