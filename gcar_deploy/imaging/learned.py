@@ -17,6 +17,7 @@ import numpy as np
 
 from gcar_deploy.imaging import enhance, segment
 from gcar_deploy.imaging import skeleton as skel
+from gcar_deploy.imaging.bands import without_bands
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
 from gcar_deploy.imaging.device_lines import device_map, device_parts
@@ -86,6 +87,12 @@ def learned_vessels(
     seen = segmenter.look(fine)
     reach, line = vessel_lines(np.where(work_holes, np.float32(0), seen.probability))
     told = device_map(segmenter, fine, seen, line, reach, work_holes)
+    shown = resize(enhance.fill_holes(pictures["display"], holes), work.shape[::-1])
+    vessels = without_bands(seen, reach, line, told, shown, work_holes, nominal_mm(work))
+    if vessels is not seen:
+        seen = vessels
+        reach, line = vessel_lines(np.where(work_holes, np.float32(0), seen.probability))
+        told = device_map(segmenter, fine, seen, line, reach, work_holes)
     device = devices(told, reach, line, work, work_holes)
     if "came" in pictures:
         came = resize(pictures["came"], work.shape[::-1]) > 0.5
@@ -138,8 +145,8 @@ def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -
     if not line.any():
         return np.zeros_like(reach)
     filled = enhance.fill_holes(picture, holes)
-    finer = float(np.sqrt(picture.size)) / SIDE
-    pixel_mm = NOMINAL_MM / finer
+    pixel_mm = nominal_mm(picture)
+    finer = NOMINAL_MM / pixel_mm
     flat = enhance.flatten(filled, enhance.FLATTEN_SIGMA_MM / pixel_mm)
     sigma_px = enhance.ridges(flat, pixel_mm).sigma_px
     half = exact_distance(reach)
@@ -154,6 +161,11 @@ def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -
         if (more & line).sum() <= DEVICE_SHARE * line.sum():
             found = more
     return found
+
+
+def nominal_mm(picture: Image) -> float:
+    """Return what a pixel is taken for where the network looks, whatever it is said to be, mm."""
+    return NOMINAL_MM * SIDE / float(np.sqrt(picture.size))
 
 
 def vessel_lines(probability: Image) -> tuple[Mask, Mask]:
