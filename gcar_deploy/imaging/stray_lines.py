@@ -21,13 +21,15 @@ from gcar_deploy.imaging.device_lines import device_parts
 from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.imaging.linegraph import LineGraph, Pixel
 from gcar_deploy.imaging.net import SIDE, network_scale
-from gcar_deploy.types import Mask
+from gcar_deploy.types import Array, Mask
 
 #: so near to the border of the field a line comes from outside, mm
 BORDER_MM = 4.0
 #: what goes on from a device over this much of its way, and is so many times as wide, is the vessel
 #: that it fills
 _FILLED_MM, WIDER = (3.0, 15.0), 1.3
+#: the vessel beyond an inlet is asked for its width over so much, mm
+_INLET_MM = 4.0
 #: side branches shorter than this are spurs; lines shorter than this move nothing; longest, mm
 SPUR_MM, SHORTEST_MM, LONGEST_MM = 6.0, 8.0, 160.0
 #: a line goes on through a fork where it turns by no more than this over so much of its way
@@ -40,7 +42,8 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
     """Yield (rows, cols) bool parts of the view's skeleton that may be no vessel.
 
     Parts beside the largest; what comes from the border, or goes on from a device that was left
-    out, to its first fork; and the same line on through forks as long as it goes straight.
+    out, to its first fork; what comes from the border to where it is wider of a sudden, the inlet
+    of the artery; and the same line on through forks as long as it goes straight.
     """
     line = view.skeleton
     px = 1.0 / view.carm.pixel_at_isocenter_mm
@@ -49,13 +52,15 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
     yield from (label == k for k in range(1, count)
                 if k != size.argmax() and size[k] >= SHORTEST_MM * px)  # fmt: skip
     graph = LineGraph(line)
-    near = _near_border(view)
+    near, half = _near_border(view), exact_distance(view.mask)
     for end in graph.ends(line & (near | _beside_device(view, px))):
         if not near[end] and _fills(view, graph, end, px):
             continue
         path, spurs = graph.walk(end, SPUR_MM * px, LONGEST_MM * px)
         if len(path) >= SHORTEST_MM * px:
             yield _drawn(line, [*path, *spurs])
+        if near[end] and (inlet := _inlet(path, half, px)) is not None:
+            yield _drawn(line, path[:inlet])
         further = _straight_on(graph, path, px)
         if len(further) >= len(path) + SHORTEST_MM * px:
             yield _drawn(line, further)
@@ -82,6 +87,18 @@ def _fills(view: VesselImage, graph: LineGraph, end: Pixel, px: float) -> bool:
     half = exact_distance(whole.mask)
     own, device = (float(np.median(half[tuple(np.transpose(p))])) for p in (path[first:], before))
     return own >= WIDER * device
+
+
+def _inlet(path: list[Pixel], half: Array, px: float) -> int | None:
+    """Return after how many pixels a line from outside is wider at once; None where nowhere."""
+    least, over = round(SHORTEST_MM * px), round(_INLET_MM * px)
+    wide = half[tuple(np.transpose(path))]
+    places = range(least, len(path) - over)
+    if not places:
+        return None
+    wider = [float(np.median(wide[k : k + over]) / np.median(wide[k - least : k])) for k in places]
+    most = int(np.argmax(wider))
+    return places[most] if wider[most] >= WIDER else None
 
 
 def likely_devices(view: VesselImage, level: float) -> Iterator[Mask]:
@@ -121,6 +138,11 @@ def lost_lines(view: VesselImage, whole: VesselImage) -> Iterator[Mask]:
 def comes_from_outside(view: VesselImage, line: Mask) -> bool:
     """Whether a line reaches the border of the field."""
     return bool((line & _near_border(view)).any())
+
+
+def shows_device(view: VesselImage) -> bool:
+    """Whether something from outside was left out of the view as a device."""
+    return view.catheter is not None and comes_from_outside(view, view.catheter)
 
 
 def _near_border(view: VesselImage) -> Mask:

@@ -4,8 +4,9 @@ Two views of one tree hold the same vessel mass in every epipolar plane. A line 
 shows breaks that. So of the lines that may be no vessel (``imaging.stray_lines``) those are left
 out, one after the other, without which the views agree far better. What the network takes for a
 device goes already where they agree a little better; so do two of them, one in each view, since a
-catheter that both show agrees as vessels do. A line that was taken for a device in one picture
-comes back where the views agree far better with it.
+catheter that both show agrees as vessels do. What comes from outside is a likely one where another
+view has such a device. A line that was taken for a device in one picture comes back where the views
+agree far better with it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from gcar_deploy.imaging.stray_lines import (
     comes_from_outside,
     likely_devices,
     lost_lines,
+    shows_device,
     stray_lines,
     with_line,
     without_line,
@@ -77,9 +79,10 @@ def partnered(
     fewer_of, more_of = functools.cache(_fewer), functools.cache(_more)
     while True:
         worst = _worst(poses)
+        devices = [shows_device(view) for view in now]
         fewer = [
-            fewer_of(view, few) if may else ()
-            for view, few, may in zip(now, least, asked, strict=True)
+            fewer_of(view, few, any(devices[:k] + devices[k + 1 :])) if may else ()
+            for k, (view, few, may) in enumerate(zip(now, least, asked, strict=True))
         ]
         likely = [[one for one, device in some if device] for some in fewer]
         tried = [(each, LIKELY_GAIN) for each in _one_of(now, likely)]
@@ -123,8 +126,11 @@ def _two_of(views: Views, instead: Sequence[Views]) -> Iterator[list[VesselImage
             yield from _one_of(once, [s if k > first else () for k, s in enumerate(instead)])
 
 
-def _fewer(view: VesselImage, least_px: float) -> list[tuple[VesselImage, bool]]:
-    """Return the view without one of its lines, and if that is a likely device, for each."""
+def _fewer(view: VesselImage, least_px: float, elsewhere: bool) -> list[tuple[VesselImage, bool]]:
+    """Return the view without one of its lines, and if that is a likely device, for each.
+
+    A line from outside is a likely one where another view has a device from outside ``elsewhere``.
+    """
     lines = _longest(stray_lines(view))
     lines += list(likely_devices(view, INSIDE))
     found = []
@@ -132,7 +138,8 @@ def _fewer(view: VesselImage, least_px: float) -> list[tuple[VesselImage, bool]]
         left = without_line(view, line)
         if left is not None and left.skeleton.sum() >= least_px:
             said = 0.0 if view.device is None else float(view.device[line].mean())
-            found.append((left, said >= LIKELY))
+            likely = elsewhere and comes_from_outside(view, line)
+            found.append((left, likely or said >= LIKELY))
     return found
 
 

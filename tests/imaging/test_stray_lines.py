@@ -12,6 +12,7 @@ from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.imaging.stray_lines import (
     comes_from_outside,
     lost_lines,
+    shows_device,
     stray_lines,
     with_line,
     without_line,
@@ -105,6 +106,30 @@ def test_what_is_wider_than_the_device_before_it_is_the_vessel_that_it_fills(
     device[catheter] = True
     view = dataclasses.replace(view, catheter=device, kept=lambda: whole)
     assert bool(list(stray_lines(view))) is asked
+
+
+@pytest.mark.parametrize(("half", "found"), [(2, False), (5, True)])
+def test_a_catheter_is_asked_to_where_the_vessel_that_it_fills_is_wider(
+    half: int, found: bool
+) -> None:
+    """From the left border a line 5 pixels wide, and on from its tip one as wide, or wider."""
+    tip = 60
+    catheter = BRANCH[0], slice(0, tip)
+    vessel = slice(BRANCH[0].start + 2 - half, BRANCH[0].start + 3 + half), slice(tip, MIDDLE)
+    lines = list(stray_lines(view_of(VESSEL, catheter, vessel)))
+    ends = sorted(int(np.argwhere(line.any(axis=0)).max()) for line in lines)
+    assert ends[-1] > MIDDLE - 8
+    assert any(abs(end - tip) <= 6 for end in ends) is found
+
+
+def test_a_device_from_outside_is_told_from_one_within() -> None:
+    device = np.zeros((SIDE, SIDE), bool)
+    view = view_of(VESSEL)
+    assert not shows_device(view)
+    device[60:65, 40:80] = True
+    assert not shows_device(dataclasses.replace(view, catheter=device))
+    device[60:65, :40] = True
+    assert shows_device(dataclasses.replace(view, catheter=device))
 
 
 def test_what_there_is_with_devices_is_made_once_however_often_it_is_asked_for() -> None:

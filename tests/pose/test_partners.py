@@ -73,6 +73,27 @@ def test_what_is_no_likely_device_is_not_asked_while_the_views_agree():
     assert asked((0.0, 0.0), lambda one, two: worse if one else 0.5 * worse) == [False, True]
 
 
+def test_a_line_from_outside_is_likely_one_where_the_other_view_has_a_device_from_there():
+    """Both views show the catheter, and one tells it."""
+    view, other = crossed(0.0), view_of(VESSEL)
+    left = np.zeros(view.mask.shape, bool)
+
+    def kept(device):
+        views = [view, dataclasses.replace(other, catheter=device)]
+        return there(
+            partnered(
+                views, poses(AGREED), (True, True), ENOUGH,
+                lambda tried: poses(better(there(tried[0]), False)), never,
+            )[0][0]
+        )  # fmt: skip
+
+    assert kept(left)
+    left[CROSSING[0], 40:80] = True
+    assert kept(left)
+    left[CROSSING[0], :40] = True
+    assert not kept(left)
+
+
 @pytest.mark.parametrize(("said", "kept"), [((SURE, SURE), False), ((SURE, 0.0), True)])
 def test_what_both_views_call_a_device_goes_if_without_both_they_agree_better(said, kept):
     """A catheter that both show: without it in one of them alone, they agree less."""
