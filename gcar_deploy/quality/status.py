@@ -23,6 +23,7 @@ from gcar_deploy.quality.gates import best_separation, disagreement_limits, kind
 from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.hidden_ends import check_hidden_ends
 from gcar_deploy.quality.human_range import check_human_range
+from gcar_deploy.quality.missing import check_missing
 from gcar_deploy.quality.scale import check_scale
 from gcar_deploy.quality.severed import check_severed
 from gcar_deploy.quality.shown import Shown
@@ -137,6 +138,7 @@ def judge(
         *check_human_range(tree), *check_ghosts(ghosts, options.quality),
         *check_anatomy(tree, [view.carm for view in views]), *check_border(tree, views),
         *check_severed(tree, views), *check_hidden_ends(tree, views),
+        *check_missing(tree, views),
     ]  # fmt: skip
     lumen = [_lumen(seen, v.carm) for seen, v in zip(shown.prints, views, strict=True)]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)
