@@ -47,8 +47,7 @@ def without_bands(
     narrow = line & (half < _NARROW_MM) & (told < _DEVICE)
     if not narrow.any() or not (line & (half > _WIDE_MM)).any():
         return seen
-    filled = enhance.fill_holes(picture, holes)
-    rise = np.clip(filled - enhance.background(filled, reach, pixel_mm), 0, None)
+    rise = enhance.rise(picture, holes, reach, pixel_mm)
     _, (along,) = skel.spread(line, (rise,), _ALONG_PX)
     per_width = along / np.maximum(half, 1e-6)
     least = _SHARE * float(np.median(per_width[narrow]))

@@ -36,8 +36,7 @@ def scaled_contrast(
     (rows, cols) float32, mm, 0 outside ``vessel`` and beyond the rim (``RIM_SHARE``); ``known_mm``
     where there is no contrast at all
     """
-    filled = enhance.fill_holes(picture, holes)
-    rise = np.clip(filled - enhance.background(filled, vessel, pixel_mm), 0, None)
+    rise = enhance.rise(picture, holes, vessel, pixel_mm)
     both = vessel & (known_mm > 0)
     c, q = rise[both].astype(np.float64), known_mm[both].astype(np.float64)
     if not c.any():

@@ -117,6 +117,20 @@ def background(picture: Image, vessel: Mask, pixel_mm: float) -> Image:
     return np.asarray(total / (near_weight + trust), dtype=np.float32)
 
 
+def rise(picture: Image, holes: Mask, vessel: Mask, pixel_mm: float) -> Image:
+    """(rows, cols) float32, >= 0: what stands out of the background behind vessels.
+
+    Parameters
+    ----------
+    picture : (rows, cols) float32, vessels bright
+    holes : (rows, cols) bool, pixels without picture
+    vessel : (rows, cols) bool, all that may be vessel: no background
+    pixel_mm : float, pixel size at the isocentre
+    """
+    filled = fill_holes(picture, holes)
+    return np.clip(filled - background(filled, vessel, pixel_mm), 0, None)
+
+
 def _blurred_pair(picture: Image, weight: Image, sigma_px: float) -> tuple[Image, Image]:
     return wide_blur(picture * weight, sigma_px), wide_blur(weight, sigma_px)
 

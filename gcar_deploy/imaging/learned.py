@@ -31,7 +31,7 @@ from gcar_deploy.imaging.net import (
     net_input,
 )
 from gcar_deploy.imaging.resample import resize
-from gcar_deploy.types import Image, Mask
+from gcar_deploy.types import Array, Image, Mask
 
 #: hysteresis on the network's probability: what is faint counts where it touches what is sure
 LEVELS = (0.15, 0.5)
@@ -85,14 +85,12 @@ def learned_vessels(
     work, work_holes = at_network_size(search, holes)
     fine = net_input(work, work_holes)
     seen = segmenter.look(fine)
-    reach, line = vessel_lines(np.where(work_holes, np.float32(0), seen.probability))
-    told = device_map(segmenter, fine, seen, line, reach, work_holes)
+    reach, line, told = _lines(segmenter, fine, seen, work_holes)
     shown = resize(enhance.fill_holes(pictures["display"], holes), work.shape[::-1])
     vessels = without_bands(seen, reach, line, told, shown, work_holes, nominal_mm(work))
     if vessels is not seen:
         seen = vessels
-        reach, line = vessel_lines(np.where(work_holes, np.float32(0), seen.probability))
-        told = device_map(segmenter, fine, seen, line, reach, work_holes)
+        reach, line, told = _lines(segmenter, fine, seen, work_holes)
     device = devices(told, reach, line, work, work_holes)
     if "came" in pictures:
         came = resize(pictures["came"], work.shape[::-1]) > 0.5
@@ -104,6 +102,14 @@ def learned_vessels(
 
     asks = device.any() and "came" not in pictures
     return drawn(device), (lambda: drawn(np.zeros_like(device))) if asks else None
+
+
+def _lines(
+    segmenter: Segmenter, channels: Array, seen: Seen, holes: Mask
+) -> tuple[Mask, Mask, Image]:
+    """Where lines are seen, their centrelines, and how probably each is a device."""
+    reach, line = vessel_lines(np.where(holes, np.float32(0), seen.probability))
+    return reach, line, device_map(segmenter, channels, seen, line, reach, holes)
 
 
 def _found(

@@ -77,9 +77,10 @@ def partnered(
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
     # Few views change from round to round.
     fewer_of, more_of = functools.cache(_fewer), functools.cache(_more)
+    has_device = functools.cache(shows_device)
     while True:
         worst = _worst(poses)
-        devices = [shows_device(view) for view in now]
+        devices = [has_device(view) for view in now]
         fewer = [
             fewer_of(view, few, any(devices[:k] + devices[k + 1 :])) if may else ()
             for k, (view, few, may) in enumerate(zip(now, least, asked, strict=True))
