@@ -1,11 +1,11 @@
 """From weighted points to a tree of centrelines with radii.
 
-The points' confidence is splatted onto a local raster and smoothed; the cells above a
-hysteresis threshold form a graph, short gaps included. Starting from the thickest cell of each
-component, the farthest cell not yet accounted for is joined to the tree along the cheapest path
-(cheap in the middle of a vessel), again and again (the idea of TEASAR, Sato et al. 2000): the
-result has no loops by construction. The paths are then drawn to the centroids of the points
-they stand for and smoothed.
+The points' confidence is splatted onto a local raster, at the place of the centreline where they
+tell of one (``line_votes``), and smoothed; the cells above a hysteresis threshold form a graph,
+short gaps included. Starting from the thickest cell of each component, the farthest cell not yet
+accounted for is joined to the tree along the cheapest path (cheap in the middle of a vessel), again
+and again (the idea of TEASAR, Sato et al. 2000): the result has no loops by construction. The paths
+are then drawn to the centroids of the points they stand for and smoothed.
 """
 
 from __future__ import annotations
@@ -20,19 +20,18 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.tree.curves import LEAST_CONFIDENCE, draw_branches
+from gcar_deploy.tree.line_votes import as_line_density, line_votes
 from gcar_deploy.tree.raster import blurred, depth_of, hysteresis, peaks, splat, touching
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Points, Scalars
 
-#: smoothing of the points' confidence before thresholding, lattice cells (sigma)
-SMOOTH_CELLS = 0.6
 #: hysteresis on the smoothed confidence: kept from ``LOW`` where connected to ``HIGH``
 LOW, HIGH = 0.08, 0.25
 #: a side branch must stick out of its parent by this many lattice cells
 MIN_BRANCH_CELLS = 4.0
 #: a component shorter than this is dropped, lattice cells
 MIN_COMPONENT_CELLS = 8.0
-#: gaps up to this long between a free end and another piece are bridged, lattice cells
+#: gaps up to this long between a free end and another piece are bridged, raster cells
 MAX_GAP_CELLS = 5.0
 #: how strongly a path prefers the middle of a vessel to its rim.
 MIDDLE_PREFERENCE = 6.0
@@ -48,6 +47,31 @@ MAX_GIVEN_RADIUS_MM = 6.0
 PAD = 4
 
 
+@dataclasses.dataclass(frozen=True)
+class Raster:
+    """How points are put onto a raster.
+
+    Attributes
+    ----------
+    finer : its cells per lattice cell
+    smooth_cells : smoothing of the confidence before thresholding, sigma in its cells
+    middle_cells : wider smoothing, whose ridges are the middle of vessels; None where those of the
+        first are
+    cover : a path accounts for what lies nearer than the first number times the depth there and
+        the second together, its cells
+    """
+
+    finer: int
+    smooth_cells: float
+    middle_cells: float | None
+    cover: tuple[float, float]
+
+
+#: of points all through a vessel, and of points on its centreline
+SOLID = Raster(1, 0.6, 1.5, cover=(1.5, 1.5))
+LINES = Raster(2, 1.0, None, cover=(1.0, 2.0))
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class CellGraph:
     """Cells above the threshold and the steps between them.
@@ -59,6 +83,7 @@ class CellGraph:
     depth_cells : (n,) distance to the nearest cell below the threshold, cells
     cost, length : (n, n) sparse symmetric, cost and length in cells of each step
     cell_mm : edge of a cell
+    raster : Raster
     """
 
     points_mm: Points
@@ -67,6 +92,7 @@ class CellGraph:
     cost: sparse.csr_matrix
     length: sparse.csr_matrix
     cell_mm: float
+    raster: Raster
 
 
 def build_tree(centers: CenterPoints) -> Tree:
@@ -76,7 +102,7 @@ def build_tree(centers: CenterPoints) -> Tree:
     ----------
     centers : CenterPoints
         ``confidence * spacing_mm**3`` is taken as vessel volume; ``radius_mm`` is used where
-        it is finite.
+        it is finite, and ``offset_mm`` where all radii are.
 
     Returns
     -------
@@ -85,7 +111,11 @@ def build_tree(centers: CenterPoints) -> Tree:
     centers = usable_points(centers)
     if not len(centers):
         return empty_tree()
-    graph = cell_graph(centers)
+    raster, seen = SOLID, centers
+    if centers.offset_mm is not None and np.isfinite(centers.radius_mm).all():
+        raster, centers = LINES, line_votes(centers)
+        seen = as_line_density(centers, centers.spacing_mm / raster.finer, raster.smooth_cells)
+    graph = cell_graph(seen, raster)
     if not len(graph.points_mm):
         return empty_tree()
     paths = _paths(graph)
@@ -113,32 +143,35 @@ def usable_points(centers: CenterPoints) -> CenterPoints:
     return clean if keep.all() else clean.select(keep)
 
 
-def cell_graph(centers: CenterPoints) -> CellGraph:
-    """Rasterise, smooth, threshold and connect; see ``CellGraph``."""
+def cell_graph(centers: CenterPoints, raster: Raster) -> CellGraph:
+    """Rasterise on cells of the points' spacing, smooth, threshold, connect; see ``CellGraph``."""
     h = centers.spacing_mm
     # Aligned with the first point, so that lattice points fall on cell centres.
     origin = centers.points_mm[0]
     centers = centers.select(centers.confidence > LEAST_CONFIDENCE)
     empty = sparse.csr_matrix((0, 0))
-    nothing = CellGraph(np.zeros((0, 3)), np.zeros(0), np.zeros(0), empty, empty, h)
+    nothing = CellGraph(np.zeros((0, 3)), np.zeros(0), np.zeros(0), empty, empty, h, raster)
     if not len(centers):
         return nothing
     at = (centers.points_mm - origin) / h
     low = np.floor(at.min(axis=0)).astype(np.int64) - PAD
     shape = np.ceil(at.max(axis=0)).astype(np.int64) + PAD + 1 - low
     density = splat(at - low, centers.confidence, shape)
-    value = blurred(density, SMOOTH_CELLS, 3.0)
+    value = blurred(density, raster.smooth_cells, 3.0)
     mask = hysteresis(value, LOW, HIGH)
     cells = np.stack(np.unravel_index(np.flatnonzero(mask), mask.shape), axis=1)
     if not len(cells):
         return nothing
     pick = tuple(cells.T)
-    middle = blurred(np.minimum(density, 1.0), 1.5, 2.0)
+    middle = value
+    if raster.middle_cells is not None:
+        middle = blurred(np.minimum(density, 1.0), raster.middle_cells, 2.0)
     # How central each cell is: 1 where the middle peaks among the neighbours, else less.
     central = middle[pick].astype(np.float64) / np.maximum(peaks(middle)[pick], 1e-12)
     cost, length = _steps(cells, mask.shape, central)
     points = origin + (cells + low) * h
-    return CellGraph(points, value[pick].astype(np.float64), depth_of(cells, mask), cost, length, h)
+    certain = value[pick].astype(np.float64)
+    return CellGraph(points, certain, depth_of(cells, mask), cost, length, h, raster)
 
 
 def _steps(
@@ -216,7 +249,7 @@ def _paths(graph: CellGraph) -> list[Array]:
     lookup = cKDTree(graph.points_mm)
     paths: list[Array] = []
     for member, root in zip(members, roots, strict=True):
-        if reach[member].max() >= MIN_COMPONENT_CELLS:
+        if reach[member].max() >= MIN_COMPONENT_CELLS * graph.raster.finer:
             tips = member[np.argsort(-reach[member], kind="stable")]
             paths += _component_paths(graph, root, tips, before, covered, lookup)
     return paths
@@ -233,6 +266,8 @@ def _component_paths(
     """Join the tips, in their order, to the tree that starts with ``root``."""
     on_tree = {root}
     paths: list[Array] = []
+    per_depth, beside = graph.raster.cover
+    least = MIN_BRANCH_CELLS * graph.raster.finer
     for tip in tips.tolist():
         if covered[tip]:
             continue
@@ -244,11 +279,11 @@ def _component_paths(
         steps = (
             np.linalg.norm(np.diff(graph.points_mm[route], axis=0), axis=1).sum() / graph.cell_mm
         )
-        keep = not paths or steps - hidden >= MIN_BRANCH_CELLS
+        keep = not paths or steps - hidden >= least
         if keep:
             paths.append(route)
             on_tree.update(path)
-            radius = (1.5 * graph.depth_cells[route] + 1.5) * graph.cell_mm
+            radius = (per_depth * graph.depth_cells[route] + beside) * graph.cell_mm
             near = lookup.query_ball_point(graph.points_mm[route], radius, return_sorted=False)
             covered[np.fromiter(itertools.chain.from_iterable(near), np.int64)] = True
         else:
