@@ -166,4 +166,4 @@ def quick_tree(
     if isinstance(predictor, SingleViewPredictor):
         predictor = None  # centres a centimetre off say nothing of millimetres between the runs
     once = dataclasses.replace(options, predict=dataclasses.replace(options.predict, lattices=1))
-    return build_tree(find_centers(seen, predictor, once, watch).points)
+    return build_tree(find_centers(seen, predictor, once, watch).points, len(views))

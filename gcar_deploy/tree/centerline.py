@@ -31,8 +31,6 @@ LOW, HIGH = 0.08, 0.25
 MIN_BRANCH_CELLS = 4.0
 #: a component shorter than this is dropped, lattice cells
 MIN_COMPONENT_CELLS = 8.0
-#: gaps up to this long between a free end and another piece are bridged, raster cells
-MAX_GAP_CELLS = 5.0
 #: how strongly a path prefers the middle of a vessel to its rim.
 MIDDLE_PREFERENCE = 6.0
 #: cost of a bridged cell beside a cell of confident vessel.
@@ -59,17 +57,20 @@ class Raster:
         first are
     cover : a path accounts for what lies nearer than the first number times the depth there and
         the second together, its cells
+    gap_cells : gaps between pieces are bridged up to the first number of its cells, of more than
+        two views up to the second: each view's gaps tear what all of them see
     """
 
     finer: int
     smooth_cells: float
     middle_cells: float | None
     cover: tuple[float, float]
+    gap_cells: tuple[float, float]
 
 
 #: of points all through a vessel, and of points on its centreline
-SOLID = Raster(1, 0.6, 1.5, cover=(1.5, 1.5))
-LINES = Raster(2, 1.0, None, cover=(1.0, 2.0))
+SOLID = Raster(1, 0.6, 1.5, cover=(1.5, 1.5), gap_cells=(5.0, 5.0))
+LINES = Raster(2, 1.0, None, cover=(1.0, 2.0), gap_cells=(5.0, 10.0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class CellGraph:
     raster: Raster
 
 
-def build_tree(centers: CenterPoints) -> Tree:
+def build_tree(centers: CenterPoints, views: int = 2) -> Tree:
     """Build the centreline tree of weighted points.
 
     Parameters
@@ -103,6 +104,8 @@ def build_tree(centers: CenterPoints) -> Tree:
     centers : CenterPoints
         ``confidence * spacing_mm**3`` is taken as vessel volume; ``radius_mm`` is used where
         it is finite, and ``offset_mm`` where all radii are.
+    views : int
+        So many views saw them.
 
     Returns
     -------
@@ -115,7 +118,7 @@ def build_tree(centers: CenterPoints) -> Tree:
     if centers.offset_mm is not None and np.isfinite(centers.radius_mm).all():
         raster, centers = LINES, line_votes(centers)
         seen = as_line_density(centers, centers.spacing_mm / raster.finer, raster.smooth_cells)
-    graph = cell_graph(seen, raster)
+    graph = cell_graph(seen, raster, views)
     if not len(graph.points_mm):
         return empty_tree()
     paths = _paths(graph)
@@ -143,7 +146,7 @@ def usable_points(centers: CenterPoints) -> CenterPoints:
     return clean if keep.all() else clean.select(keep)
 
 
-def cell_graph(centers: CenterPoints, raster: Raster) -> CellGraph:
+def cell_graph(centers: CenterPoints, raster: Raster, views: int) -> CellGraph:
     """Rasterise on cells of the points' spacing, smooth, threshold, connect; see ``CellGraph``."""
     h = centers.spacing_mm
     # Aligned with the first point, so that lattice points fall on cell centres.
@@ -168,14 +171,14 @@ def cell_graph(centers: CenterPoints, raster: Raster) -> CellGraph:
         middle = blurred(np.minimum(density, 1.0), raster.middle_cells, 2.0)
     # How central each cell is: 1 where the middle peaks among the neighbours, else less.
     central = middle[pick].astype(np.float64) / np.maximum(peaks(middle)[pick], 1e-12)
-    cost, length = _steps(cells, mask.shape, central)
+    cost, length = _steps(cells, mask.shape, central, raster.gap_cells[views > 2])
     points = origin + (cells + low) * h
     certain = value[pick].astype(np.float64)
     return CellGraph(points, certain, depth_of(cells, mask), cost, length, h, raster)
 
 
 def _steps(
-    cells: Array, shape: tuple[int, ...], central: Scalars
+    cells: Array, shape: tuple[int, ...], central: Scalars, most_gap: float
 ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
     """Link neighbours, and bridge between pieces."""
     n = len(cells)
@@ -184,7 +187,7 @@ def _steps(
     cost = length * np.exp(MIDDLE_PREFERENCE * off_middle)
     grid = sparse.csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     piece = csgraph.connected_components(grid, directed=False)[1]
-    bridges, gap = _bridges(cells, piece)
+    bridges, gap = _bridges(cells, piece, most_gap)
     pairs = np.concatenate([pairs, bridges])
     length = np.concatenate([length, gap])
     cost = np.concatenate([cost, gap * BRIDGE_COST])
@@ -199,7 +202,7 @@ def _steps(
     return cost_of, length_of
 
 
-def _bridges(cells: Array, piece: Array) -> tuple[Array, Scalars]:
+def _bridges(cells: Array, piece: Array, most_gap: float) -> tuple[Array, Scalars]:
     """Shortest links between separate pieces, a spanning forest of them: (b, 2), (b,) cells."""
     found: list[tuple[float, int, int]] = []
     count = int(piece.max()) + 1
@@ -208,9 +211,7 @@ def _bridges(cells: Array, piece: Array) -> tuple[Array, Scalars]:
     for i in range(count):
         for j in range(i + 1, count):
             small, large = (i, j) if len(members[i]) <= len(members[j]) else (j, i)
-            d, at = trees[large].query(
-                cells[members[small]], distance_upper_bound=MAX_GAP_CELLS + 1
-            )
+            d, at = trees[large].query(cells[members[small]], distance_upper_bound=most_gap + 1)
             k = int(np.argmin(d))
             if np.isfinite(d[k]):
                 found.append((float(d[k]), int(members[small][k]), int(members[large][at[k]])))

@@ -93,7 +93,7 @@ def fit_tubes(
     if should_stop is not None:
         # Whoever cancelled raises here; a deadline is heeded by the first step.
         should_stop()
-    tree = build_tree(settled_centers)
+    tree = build_tree(settled_centers, len(views))
     fit = TubeFit(
         tree=tree,
         centers=settled_centers,

@@ -239,7 +239,7 @@ def _nearer_to(left: Tree, whole: Tree, gaussians: Gaussians) -> Gaussians:
 
 def _unrefined(centers: CenterPoints, views: int) -> Refined:
     """Tree and Gaussians straight from the points."""
-    tree = build_tree(centers)
+    tree = build_tree(centers, views)
     return Refined(
         refiner="none",
         gaussians=gaussians_on_tree(tree),

@@ -72,3 +72,12 @@ def test_offsets_that_are_not_finite_leave_points_in_place():
     tree = build_tree(dataclasses.replace(whole, offset_mm=bad))
     assert np.isfinite(tree.points()).all()
     assert len(tree.branches) == 1
+
+
+def test_more_than_two_views_tear_vessels_more_often():
+    whole = cylinders([0.0], radius=2.0)
+    torn = whole.select(np.abs(whole.points_mm[:, 2]) > 2.5)
+    assert len(build_tree(torn).branches) == 2
+    assert len(build_tree(torn, views=3).branches) == 1
+    far = whole.select(np.abs(whole.points_mm[:, 2]) > 5.0)
+    assert len(build_tree(far, views=3).branches) == 2
