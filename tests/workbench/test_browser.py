@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import deliver
+from gcar_deploy.geometry.scene import parse_scene
 from gcar_deploy.inputs.order import Order, load_order, parse_order
+from gcar_deploy.tree.curves import resample
 from tests.conftest import of_data, ready_case
 from tests.workbench.conftest import finished
 
@@ -226,29 +229,33 @@ def test_a_stated_alternative_is_shown_and_picked(serve, browse):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("segmenter", "gain", "least"), [("classic", 0.01, 0.78), ("auto", -0.005, 0.82)]
-)
-def test_corrections_mend_a_raw_case(serve, engine, segmenter, gain, least):
-    """Two ends of vessels that view 1 lacks and a faint one, painted.
+@pytest.mark.parametrize(("segmenter", "least"), [("classic", 0.78), ("auto", 0.82)])
+def test_corrections_mend_a_raw_case(serve, engine, segmenter, least):
+    """Two ends of vessels that view 1 lacks and a faint one, painted: the tree follows them.
 
-    DSC by the ridge filter alone from 0.779 to 0.798; the network finds the ends by itself (0.834).
+    DSC by the ridge filter alone from 0.777 to 0.785, with the network from 0.820 to 0.827.
     """
     import nibabel
 
     folder = ready_case("R_0401")
     truth = np.asarray(nibabel.load(folder / "truth.nii.gz").dataobj) >= 0.5
+    carm = parse_scene((folder / "geom.json").read_text()).views[0].carm
     views = (folder / "view1.png", folder / "view2.png")
     given = Order(views=views, geometry=folder / "geom.json", segmenter=segmenter)
     missed = [[[296, 137], [309, 146], [323, 155]], [[164, 179], [147, 192]],
               [[96, 254], [121, 233]]]  # fmt: skip
     strokes = [{"do": "paint", "width_px": 9, "points": points} for points in missed]
     corrected = parse_order({**given.to_dict(), "edits": {"1": strokes}})
-    found = []
+    painted = np.concatenate([resample(np.array(points, float), 1.0) for points in missed])
+    found, followed = [], []
     for order in (given, corrected):
-        made = engine.reconstruct_order(order).volume >= 0.5
+        result = engine.reconstruct_order(order)
+        made = result.volume >= 0.5
         found.append(2 * (made & truth).sum() / (made.sum() + truth.sum()))
-    assert found[0] + gain < found[1] and found[1] > least, found
+        shown = cKDTree(carm.project(result.tree.points())[0])
+        followed.append((shown.query(painted)[0] < 4.0).mean())
+    assert found[0] < found[1] and found[1] > least, found
+    assert followed[0] < 0.9 and followed[1] > 0.95, followed
 
 
 @pytest.mark.slow
