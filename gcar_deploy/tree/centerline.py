@@ -37,8 +37,9 @@ MIDDLE_PREFERENCE = 6.0
 BRIDGE_COST = 4.0
 #: points further than this from the middle one (along an axis) are no coronary vessel, mm.
 MAX_REACH_MM = 200.0
-#: cells of the local raster at most.
-MAX_CELLS = 40_000_000
+#: cells of the local raster at most, of the points' lattice and of a finer one; where the latter
+#: would have more, points stay where they are
+MAX_CELLS, MAX_FINE_CELLS = 40_000_000, 80_000_000
 #: a larger given radius is no coronary vessel's, mm.
 MAX_GIVEN_RADIUS_MM = 6.0
 #: empty cells round the raster.
@@ -116,8 +117,10 @@ def build_tree(centers: CenterPoints, views: int = 2) -> Tree:
         return empty_tree()
     raster, seen = SOLID, centers
     if centers.offset_mm is not None and np.isfinite(centers.radius_mm).all():
-        raster, centers = LINES, line_votes(centers)
-        seen = as_line_density(centers, centers.spacing_mm / raster.finer, raster.smooth_cells)
+        votes, cell_mm = line_votes(centers), centers.spacing_mm / LINES.finer
+        if np.prod(np.ptp(votes.points_mm, axis=0) / cell_mm + 2 * PAD) <= MAX_FINE_CELLS:
+            raster, centers = LINES, votes
+            seen = as_line_density(votes, cell_mm, raster.smooth_cells)
     graph = cell_graph(seen, raster, views)
     if not len(graph.points_mm):
         return empty_tree()
@@ -170,7 +173,7 @@ def cell_graph(centers: CenterPoints, raster: Raster, views: int) -> CellGraph:
     if raster.middle_cells is not None:
         middle = blurred(np.minimum(density, 1.0), raster.middle_cells, 2.0)
     # How central each cell is: 1 where the middle peaks among the neighbours, else less.
-    central = middle[pick].astype(np.float64) / np.maximum(peaks(middle)[pick], 1e-12)
+    central = middle[pick].astype(np.float64) / np.maximum(peaks(middle, cells), 1e-12)
     cost, length = _steps(cells, mask.shape, central, raster.gap_cells[views > 2])
     points = origin + (cells + low) * h
     certain = value[pick].astype(np.float64)

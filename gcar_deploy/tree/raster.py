@@ -1,13 +1,13 @@
 """A local raster of vessel cells: deposit, smooth, threshold, distances, neighbours.
 
-Vessels fill some percent of the raster, and only the filters run over all of it.
+Vessels fill some percent of the raster or less, so work is done where there is something, and what
+is never written costs no memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
 
-import cv2
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -41,38 +41,35 @@ def blurred(volume: Array, sigma: float, truncate: float) -> Array:
     reach = int(truncate * sigma + 0.5)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     kernel = (kernel / kernel.sum()).astype(np.float32)
-    one = np.ones(1, np.float32)
-
-    def smooth(image: Array, down: bool) -> Array:
-        along, across = (one, kernel) if down else (kernel, one)
-        out: Array = cv2.sepFilter2D(
-            image, cv2.CV_32F, along, across, borderType=cv2.BORDER_CONSTANT
-        )
-        return out
-
-    return _by_axis(volume, smooth)
-
-
-def _by_axis(volume: Array, filtered: Callable[[Array, bool], Array]) -> Array:
-    """Filter (rows, cols) float32 pictures made of a volume along each of its axes in turn.
-
-    ``filtered`` takes a picture and whether to filter down its columns, else along its rows.
-    """
-    shape = volume.shape
-    image: Array = np.ascontiguousarray(volume, dtype=np.float32).reshape(shape[0], -1)
-    image = filtered(image, True).reshape(-1, shape[2])
-    image = filtered(image, False).reshape(shape)
-    return np.stack([filtered(slab, True) for slab in image])
+    out = volume
+    for count, stride in zip(volume.shape, _strides(volume.shape), strict=True):
+        flat = np.flatnonzero(out != 0)
+        values = out.reshape(-1)[flat].astype(np.float32)
+        place = flat // stride % count
+        out = np.zeros(volume.shape, np.float32)
+        cells = out.reshape(-1)
+        for step, share in zip(range(-reach, reach + 1), kernel, strict=True):
+            inside = (place >= -step) & (place < count - step)
+            cells[flat[inside] + step * stride] += share * values[inside]
+    return out
 
 
-def peaks(volume: Array) -> Array:
-    """Highest value within two cells along every axis, float32."""
-    five = np.ones(5, np.uint8)
+def peaks(volume: Array, cells: Array) -> Array:
+    """(n,) highest value within two cells along every axis of (n, 3) cells."""
+    near = [
+        [np.clip(at + step, 0, count - 1) * stride for step in range(-2, 3)]
+        for at, count, stride in zip(cells.T, volume.shape, _strides(volume.shape), strict=True)
+    ]
+    values = volume.reshape(-1)
+    out: Array = values[near[0][2] + near[1][2] + near[2][2]]
+    for x, y, z in itertools.product(*near):
+        np.maximum(out, values[x + y + z], out=out)
+    return out
 
-    def highest(image: Array, down: bool) -> Array:
-        return cv2.dilate(image, five[:, None] if down else five[None])
 
-    return _by_axis(volume, highest)
+def _strides(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """By how much the flat index grows along each of three axes."""
+    return shape[1] * shape[2], shape[2], 1
 
 
 def hysteresis(value: Array, low: float, high: float) -> Array:
@@ -91,7 +88,7 @@ def hysteresis(value: Array, low: float, high: float) -> Array:
 def depth_of(cells: Array, mask: Array) -> Scalars:
     """(n,) distance from each cell to the nearest one outside ``mask``, cells."""
     flat = np.ravel_multi_index(tuple(cells.T), mask.shape)
-    stride = np.array([mask.shape[1] * mask.shape[2], mask.shape[2], 1])
+    stride = np.array(_strides(mask.shape))
     inside = mask.reshape(-1)
     length = np.sqrt(np.einsum("ij,ij->i", NEAR_CELLS, NEAR_CELLS).astype(np.float64))
     out = np.full(len(cells), np.inf)
@@ -104,30 +101,32 @@ def depth_of(cells: Array, mask: Array) -> Scalars:
         out[left[out_here]] = length[k]
         left = left[~out_here]
     if len(left):
-        outside = np.argwhere(_grown(cells, mask.shape) & ~mask)
-        out[left] = cKDTree(outside).query(cells[left])[0]
+        around = np.flatnonzero(_grown(cells, mask.shape))
+        outside = np.unravel_index(around[~inside[around]], mask.shape)
+        out[left] = cKDTree(np.stack(outside, axis=1)).query(cells[left])[0]
     return out
 
 
 def _grown(cells: Array, shape: tuple[int, ...]) -> Array:
-    """Mask of the cells and their 26 neighbours; no cell lies on the border of ``shape``."""
+    """Flat mask of cells and their 26 neighbours; no cell lies on the border of ``shape``."""
     out = np.zeros(int(np.prod(shape)), bool)
     flat = np.ravel_multi_index(tuple(cells.T), shape)
     for dx, dy, dz in np.ndindex(3, 3, 3):
         out[flat + ((dx - 1) * shape[1] + dy - 1) * shape[2] + dz - 1] = True
-    return out.reshape(shape)
+    return out
 
 
 def touching(cells: Array, shape: tuple[int, ...]) -> tuple[Array, Scalars]:
     """(p, 2) pairs among the 26 neighbours, and (p,) their distance, cells."""
     flat = np.ravel_multi_index(tuple(cells.T), shape)
-    number = np.full(int(np.prod(shape)), -1, np.int32)
-    number[flat] = np.arange(len(cells))
+    # From 1 on: nothing is written where there is no cell.
+    number = np.zeros(int(np.prod(shape)), np.int32)
+    number[flat] = np.arange(1, len(cells) + 1)
     pairs, length = [], []
     for offset in list(np.ndindex(3, 3, 3))[14:]:
         step = np.array(offset) - 1
         other = number[flat + (step[0] * shape[1] + step[1]) * shape[2] + step[2]]
-        here = np.flatnonzero(other >= 0)
-        pairs.append(np.stack([here, other[here]], axis=1))
+        here = np.flatnonzero(other)
+        pairs.append(np.stack([here, other[here] - 1], axis=1))
         length.append(np.full(len(here), np.sqrt(float(step @ step))))
     return np.concatenate(pairs), np.concatenate(length)

@@ -81,3 +81,15 @@ def test_more_than_two_views_tear_vessels_more_often():
     assert len(build_tree(torn, views=3).branches) == 1
     far = whole.select(np.abs(whole.points_mm[:, 2]) > 5.0)
     assert len(build_tree(far, views=3).branches) == 2
+
+
+def test_a_box_too_large_for_finer_cells_is_worked_on_as_it_is():
+    near = cylinders([0.0], radius=0.8, length=20.0, edge=0.3)
+    apart = np.concatenate([near.points_mm, near.points_mm + 75.0])
+    both = dataclasses.replace(
+        near, points_mm=apart, confidence=np.tile(near.confidence, 2),
+        radius_mm=np.tile(near.radius_mm, 2), offset_mm=np.tile(near.offset_mm, (2, 1)),
+    )  # fmt: skip
+    blind = build_tree(dataclasses.replace(both, offset_mm=None))
+    assert len(blind.branches) == 2
+    assert build_tree(both).points().tobytes() == blind.points().tobytes()
