@@ -18,6 +18,7 @@ from gcar_deploy.predict.center_map import DEPTH_PIXELS, encode_depth
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor
 from gcar_deploy.predict.centers import Seen, seen_by_all
 from gcar_deploy.predict.decision import decide
+from gcar_deploy.tree.line_votes import line_votes
 from gcar_deploy.types import Points, Volume
 from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.render import path_and_depth
@@ -42,8 +43,7 @@ def predicted(predictor: Predictor, posed: Seen) -> dict[str, Points]:
         return {"paper": np.concatenate([view.points_mm for view in alone])}
     error = max(view.path_error for view in posed.views)
     found = decide(predictor.predict(posed.hull, posed.encoded), posed.encoded, error)
-    offset = 0.0 if found.offset_mm is None else found.offset_mm
-    return {"multi": (found.points_mm + offset)[found.confidence >= 0.5]}
+    return {"multi": line_votes(found).points_mm[found.confidence >= 0.5]}
 
 
 def depth_error_px(predictor: SingleViewPredictor, posed: Seen, tree: Capsules) -> float:

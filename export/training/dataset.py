@@ -17,6 +17,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.predict.encoding import Encoded, encode
 from gcar_deploy.predict.hull import Candidates, visual_hull
+from gcar_deploy.tree.line_votes import THINNEST_CELLS
 from gcar_deploy.types import Image
 from gcar_export.scenes.capsules import Capsules, LabelTree
 from gcar_export.scenes.pictures import PATH_ERRORS, as_mask, degrade, with_noise
@@ -33,8 +34,6 @@ from gcar_export.training.examinations import (
 PATH_CELLS = (0.15, 0.5)
 #: scenes with fewer candidates, or vessel among them, are drawn again, as are larger ones
 FEWEST_POINTS, FEWEST_VESSEL = 300, 60
-#: a vessel thinner than this counts as so thick where cells are judged: it must fill some cell
-THINNEST_CELLS = 0.7
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,8 @@ import numpy as np
 
 from gcar_deploy.gaussians.centers import CenterPoints
 
-#: a vessel thinner than this counts as so thick where cells are judged, as in training, cells
+#: a vessel thinner than this counts as so thick where cells are judged, in training as here: it
+#: must fill some cell
 THINNEST_CELLS = 0.7
 
 

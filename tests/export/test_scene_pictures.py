@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.tree.line_votes import THINNEST_CELLS
 from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.gantry import Field, clinical_views, focused, random_rotation
 from gcar_export.scenes.pictures import PATH_ERRORS, as_mask, spoil, with_noise
 from gcar_export.scenes.render import path_lengths
-from gcar_export.training.dataset import THINNEST_CELLS, given, training_scene, truth_at
+from gcar_export.training.dataset import given, training_scene, truth_at
 from gcar_export.training.examinations import (
     CLINICAL_CELLS_MM,
     FINE_CELLS_MM,
