@@ -184,6 +184,12 @@ def objective(
     return total
 
 
+def empty_objective(targets: list[Target], options: TubeOptions) -> float:
+    """Return the objective of a model without tubes."""
+    c2 = options.robust_sigmas**2
+    return sum(0.5 * c2 * target.empty_cost * target.pixel_mm**2 for target in targets)
+
+
 def normal_equations(
     tubes: Tubes,
     targets: list[Target],

@@ -13,6 +13,7 @@ from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import (
     Ending,
     Progress,
+    empty_objective,
     fit_level,
     footprints,
     normal_equations,
@@ -62,6 +63,16 @@ def test_gradient_matches_differences():
         down = dataclasses.replace(tubes, log_radius=tubes.log_radius - step)
         errors.append((value(up) - value(down)) / (2 * h) - gradient[k])
     assert np.abs(errors).max() < 0.05 * np.abs(gradient[split:]).max()
+
+
+def test_no_tube_costs_what_every_pixel_costs():
+    targets = make_targets(seen(fork(), two_views(128, 1.0)), 1.0, OPTIONS)
+    c2, expected = OPTIONS.robust_sigmas**2, 0.0
+    for target in targets:
+        z2 = (target.path_mm / target.sigma_mm) ** 2
+        cost = 0.5 * c2 * np.log1p(z2 / c2) * target.weight
+        expected += float(cost.sum()) * target.pixel_mm**2
+    assert empty_objective(targets, OPTIONS) == pytest.approx(expected)
 
 
 def test_hessian_is_the_sum_over_entries():

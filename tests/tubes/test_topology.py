@@ -14,7 +14,7 @@ from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import empty_tree
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.run import Run
-from gcar_deploy.tubes.topology import _hanging, loose_mm
+from gcar_deploy.tubes.topology import MOST_GIVEN_UP, _hanging, loose_mm
 from tests.conftest import ready_case
 from tests.tree.shapes import fork, grid, points_of
 from tests.tubes.scenes import seen, two_views
@@ -85,10 +85,14 @@ def test_vessels_with_exchanged_partners_hang_on_the_tree_again(monkeypatch):
     left = fit_tubes(start, views, TubeOptions(), evidence=told).tree
     assert loose_mm(left) > 40.0
     assert cKDTree(truth.points()).query(left.points())[0].max() > 10.0
+    monkeypatch.undo()
+    monkeypatch.setattr("gcar_deploy.tubes.topology.MOST_GIVEN_UP", 0.0)
+    same = fit_tubes(start, views, TubeOptions(), evidence=told).tree
+    assert same.points().tobytes() == left.points().tobytes()
 
 
-def test_no_tree_is_fitted_on_trial_twice(monkeypatch):
-    """A line that is refused is proposed again by the next pass."""
+def _trials(monkeypatch, most_given_up):
+    """Trees that P_0001 was fitted with on trial, and what came out."""
     folder, tried = ready_case("P_0001"), []
     fit = Run.tried
 
@@ -96,7 +100,18 @@ def test_no_tree_is_fitted_on_trial_twice(monkeypatch):
         tried.append((tree.points().tobytes(), tree.radii().tobytes()))
         return fit(run, tree, targets)
 
-    monkeypatch.setattr(Run, "tried", counted)
-    views = [folder / "view1.png", folder / "view2.png"]
-    Engine(threads=1).reconstruct(views, folder / "geom.json")
-    assert len(set(tried)) == len(tried) > 3
+    with monkeypatch.context() as patched:
+        patched.setattr(Run, "tried", counted)
+        patched.setattr("gcar_deploy.tubes.topology.MOST_GIVEN_UP", most_given_up)
+        views = [folder / "view1.png", folder / "view2.png"]
+        found = Engine(threads=1).reconstruct(views, folder / "geom.json")
+    return tried, found.tree.points()
+
+
+def test_what_explains_much_is_not_proposed_anew(monkeypatch):
+    """A line that is refused is not fitted again by the next pass."""
+    every, slow = _trials(monkeypatch, np.inf)
+    assert len(set(every)) == len(every) > 3
+    some, quick = _trials(monkeypatch, MOST_GIVEN_UP)
+    assert len(some) < len(every)
+    assert quick.tobytes() == slow.tobytes()
