@@ -17,6 +17,8 @@ from gcar_deploy.types import Array, Scalars
 
 #: distances to the nearest empty cell are looked up so far, in order, and searched for beyond.
 NEAR_CELLS = np.array(list(np.ndindex(5, 5, 5)), np.int64) - 2
+#: steps to a cell's 26 neighbours, itself in the middle
+STEPS = np.array(list(np.ndindex(3, 3, 3)), np.int64) - 1
 
 
 def splat(at: Array, weight: Scalars, shape: Array) -> Array:
@@ -25,12 +27,12 @@ def splat(at: Array, weight: Scalars, shape: Array) -> Array:
     base = np.floor(at).astype(np.int64)
     # Of either neighbour along each axis: its share.
     sides = [(1 - s, s) for s in np.ascontiguousarray((at - base).T)]
-    first = np.ravel_multi_index(tuple(base.T), tuple(shape))
+    first, strides = np.ravel_multi_index(tuple(base.T), tuple(shape)), _strides(shape)
     flat, part = [], []
     for x, y, z in np.ndindex(2, 2, 2):
         w = weight * (sides[0][x] * sides[1][y] * sides[2][z])
         some = np.flatnonzero(w > 0)
-        flat.append(first[some] + (x * shape[1] + y) * shape[2] + z)
+        flat.append(first[some] + np.array([x, y, z]) @ strides)
         part.append(w[some])
     out = np.bincount(np.concatenate(flat), np.concatenate(part), minlength=int(shape.prod()))
     return out.reshape(shape)
@@ -67,9 +69,9 @@ def peaks(volume: Array, cells: Array) -> Array:
     return out
 
 
-def _strides(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """By how much the flat index grows along each of three axes."""
-    return shape[1] * shape[2], shape[2], 1
+def _strides(shape: tuple[int, ...] | Array) -> Array:
+    """(3,) by how much the flat index grows along each axis."""
+    return np.array([shape[1] * shape[2], shape[2], 1], np.int64)
 
 
 def hysteresis(value: Array, low: float, high: float) -> Array:
@@ -88,7 +90,7 @@ def hysteresis(value: Array, low: float, high: float) -> Array:
 def depth_of(cells: Array, mask: Array) -> Scalars:
     """(n,) distance from each cell to the nearest one outside ``mask``, cells."""
     flat = np.ravel_multi_index(tuple(cells.T), mask.shape)
-    stride = np.array(_strides(mask.shape))
+    stride = _strides(mask.shape)
     inside = mask.reshape(-1)
     length = np.sqrt(np.einsum("ij,ij->i", NEAR_CELLS, NEAR_CELLS).astype(np.float64))
     out = np.full(len(cells), np.inf)
@@ -111,8 +113,8 @@ def _grown(cells: Array, shape: tuple[int, ...]) -> Array:
     """Flat mask of cells and their 26 neighbours; no cell lies on the border of ``shape``."""
     out = np.zeros(int(np.prod(shape)), bool)
     flat = np.ravel_multi_index(tuple(cells.T), shape)
-    for dx, dy, dz in np.ndindex(3, 3, 3):
-        out[flat + ((dx - 1) * shape[1] + dy - 1) * shape[2] + dz - 1] = True
+    for offset in STEPS @ _strides(shape):
+        out[flat + offset] = True
     return out
 
 
@@ -123,9 +125,10 @@ def touching(cells: Array, shape: tuple[int, ...]) -> tuple[Array, Scalars]:
     number = np.zeros(int(np.prod(shape)), np.int32)
     number[flat] = np.arange(1, len(cells) + 1)
     pairs, length = [], []
-    for offset in list(np.ndindex(3, 3, 3))[14:]:
-        step = np.array(offset) - 1
-        other = number[flat + (step[0] * shape[1] + step[1]) * shape[2] + step[2]]
+    strides = _strides(shape)
+    # Of each two neighbours one is ahead.
+    for step in STEPS[14:]:
+        other = number[flat + step @ strides]
         here = np.flatnonzero(other)
         pairs.append(np.stack([here, other[here] - 1], axis=1))
         length.append(np.full(len(here), np.sqrt(float(step @ step))))

@@ -180,14 +180,18 @@ def objective(
         z2 = ((path - target.contrast * seen.totals()) / sigma) ** 2
         change = np.log1p(z2 / c2) - np.log1p((path / sigma) ** 2 / c2)
         cost = target.empty_cost + float((change * target.weight.reshape(-1)[pixel]).sum())
-        total += 0.5 * c2 * cost * target.pixel_mm**2
+        total += _data_term(target, cost, options)
     return total
 
 
 def empty_objective(targets: list[Target], options: TubeOptions) -> float:
     """Return the objective of a model without tubes."""
-    c2 = options.robust_sigmas**2
-    return sum(0.5 * c2 * target.empty_cost * target.pixel_mm**2 for target in targets)
+    return sum(_data_term(target, target.empty_cost, options) for target in targets)
+
+
+def _data_term(target: Target, cost: float, options: TubeOptions) -> float:
+    """Return what a picture adds to the objective; ``cost`` as ``Target.empty_cost``."""
+    return 0.5 * options.robust_sigmas**2 * cost * target.pixel_mm**2
 
 
 def normal_equations(
