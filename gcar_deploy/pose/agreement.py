@@ -73,8 +73,9 @@ def agreeing(
         if seen is tried and readings is _likeliest:
             break
         fewer, closer = partnered(
-            seen, poses, asked, limits.parts_disagreement_raw, estimate, judge
-        )
+            seen, poses, asked, limits.parts_disagreement_raw, limits.good_disagreement_raw,
+            estimate, judge,
+        )  # fmt: skip
         if max(p.after for p in closer) <= limits.good_disagreement_raw:
             return fewer, closer, _changed(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.

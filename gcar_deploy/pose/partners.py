@@ -6,7 +6,8 @@ out, one after the other, without which the views agree far better. What the net
 device goes already where they agree a little better; so do two of them, one in each view, since a
 catheter that both show agrees as vessels do. What comes from outside is a likely one where another
 view has such a device. A line that was taken for a device in one picture comes back where the views
-agree far better with it.
+agree far better with it. Where two views contradict each other after all that, the line goes that
+is likeliest to be no vessel by all that is known of it (``odds``).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeAlias
+
+import numpy as np
 
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.stray_lines import (
@@ -25,6 +28,7 @@ from gcar_deploy.imaging.stray_lines import (
     with_line,
     without_line,
 )
+from gcar_deploy.pose.odds import lines_of, without_likeliest, worst
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.types import Mask
 
@@ -52,6 +56,7 @@ Views: TypeAlias = "Sequence[VesselImage]"
 
 def partnered(
     views: Sequence[VesselImage], poses: tuple[Pose, ...], asked: Sequence[bool], enough: float,
+    contradict: float,
     estimate: Callable[[Views], tuple[Pose, ...]],
     judge: Callable[[Views, tuple[Pose, ...]], tuple[Pose, ...]],
 ) -> tuple[list[VesselImage], tuple[Pose, ...]]:  # fmt: skip
@@ -66,6 +71,7 @@ def partnered(
     asked : of each view whether its lines may be left out
     enough : disagreement, 0 .. 1, from which on a line has to be a likely device to go, and to
         change more to come back
+    contradict : disagreement from which on two views contradict each other
     estimate : poses of such views
     judge : poses of such views as they are, with what the views say of them
 
@@ -77,9 +83,10 @@ def partnered(
     least = [KEPT_SHARE * view.skeleton.sum() for view in views]
     # Few views change from round to round.
     fewer_of, more_of = functools.cache(_fewer), functools.cache(_more)
-    has_device = functools.cache(shows_device)
+    has_device, every_line = functools.cache(shows_device), functools.cache(lines_of)
+    gone = [np.zeros_like(view.mask) for view in views]
     while True:
-        worst = _worst(poses)
+        left = worst(poses)
         devices = [has_device(view) for view in now]
         fewer = [
             fewer_of(view, few, any(devices[:k] + devices[k + 1 :])) if may else ()
@@ -89,28 +96,41 @@ def partnered(
         tried = [(each, LIKELY_GAIN) for each in _one_of(now, likely)]
         if len(now) <= MOST_TWO_OF:
             tried += [(each, LIKELY_GAIN) for each in _two_of(now, likely)]
-        if worst > enough:
+        if left > enough:
             others = [[one for one, device in some if not device] for some in fewer]
             tried += [(each, GAIN) for each in _one_of(now, others)]
-        gain = GAIN if worst > enough else BACK_GAIN
-        lost = [more_of(view) if may else () for view, may in zip(now, asked, strict=True)]
+        gain = GAIN if left > enough else BACK_GAIN
+        # What went by its odds stays away, or it would come and go for ever.
+        lost = [
+            [one for one in more_of(view) if not _of(one[0].mask & ~view.mask, out)] if may else ()
+            for view, may, out in zip(now, asked, gone, strict=True)
+        ]
         tried += [(each, gain) for each in _one_of(now, _back(lost))]
-        if not tried:
-            break
         if len(now) > 2:
-            tried.sort(key=lambda one: _worst(judge(one[0], poses)) / one[1])
+            tried.sort(key=lambda one: worst(judge(one[0], poses)) / one[1])
             del tried[MOST_FITTED:]
-        found = [estimate(each) for each, _ in tried]
-        after = [_worst(some) / gain for some, (_, gain) in zip(found, tried, strict=True)]
-        best = after.index(min(after))
-        if after[best] > worst:
+        fitted = [estimate(each) for each, _ in tried]
+        after = [worst(some) / gain for some, (_, gain) in zip(fitted, tried, strict=True)]
+        if after and min(after) <= left:
+            best = after.index(min(after))
+            now, poses = tried[best][0], fitted[best]
+            continue
+        if len(now) > 2 or left <= contradict:
             break
-        now, poses = tried[best][0], found[best]
+        closer = without_likeliest(now, poses, asked, least, devices, every_line, estimate)
+        if closer is None:
+            break
+        gone = [
+            out | (view.mask & ~fewer.mask)
+            for out, view, fewer in zip(gone, now, closer[0], strict=True)
+        ]
+        now, poses = closer
     return now, poses
 
 
-def _worst(poses: Sequence[Pose]) -> float:
-    return max(pose.after for pose in poses)
+def _of(part: Mask, whole: Mask) -> bool:
+    """Whether most of a part is of the whole."""
+    return bool(2 * np.count_nonzero(part & whole) > np.count_nonzero(part))
 
 
 def _one_of(views: Views, instead: Sequence[Views]) -> Iterator[list[VesselImage]]:

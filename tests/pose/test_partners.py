@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gcar_deploy.imaging.stray_lines import without_line
+from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.pose.partners import BACK_GAIN, GAIN, LIKELY, MOST_FITTED, partnered
 from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, view_of
 
-AGREED, ENOUGH = 0.05, 0.1
+AGREED, ENOUGH, CONTRADICT = 0.05, 0.1, 0.18
 
 
-def crossed(said: float):
-    """A vessel and a line from the border to it, which the network calls so probably a device."""
+def crossed(said: float, turned_deg: float = 0.0):
+    """A vessel and a line from the border to it, which the network calls so probably a device.
+
+    The line runs along the epipolar planes, so that nobody can say whether it crosses too many.
+    """
     left = CROSSING[0], slice(0, MIDDLE)
     view = view_of(VESSEL, left)
+    carm = dataclasses.replace(view.carm, primary_angle_deg=turned_deg)
+    view = dataclasses.replace(view, carm=carm)
     device = np.zeros(view.mask.shape, np.float32)
     device[CROSSING[0], : MIDDLE - 8] = said
     return dataclasses.replace(view, device=device)
@@ -29,7 +34,7 @@ def there(view) -> bool:
 
 
 def poses(after: float):
-    return (SimpleNamespace(after=0.0), SimpleNamespace(after=after))
+    return (Pose(), Pose(after=after))
 
 
 def never(tried, poses):
@@ -38,12 +43,12 @@ def never(tried, poses):
 
 def asked(said, after, may=(True, True)):
     """Which of two views keep the line, where ``after`` says how well views with so many agree."""
-    views = [crossed(one) for one in said]
+    views = [crossed(one, 90.0 * k) for k, one in enumerate(said)]
 
     def estimate(tried):
         return poses(after(*(there(view) for view in tried)))
 
-    kept, found = partnered(views, estimate(views), may, ENOUGH, estimate, never)
+    kept, found = partnered(views, estimate(views), may, ENOUGH, CONTRADICT, estimate, never)
     assert found[1].after == after(*(there(view) for view in kept))
     return [there(view) for view in kept]
 
@@ -82,7 +87,7 @@ def test_a_line_from_outside_is_likely_one_where_the_other_view_has_a_device_fro
         views = [view, dataclasses.replace(other, catheter=device)]
         return there(
             partnered(
-                views, poses(AGREED), (True, True), ENOUGH,
+                views, poses(AGREED), (True, True), ENOUGH, CONTRADICT,
                 lambda tried: poses(better(there(tried[0]), False)), never,
             )[0][0]
         )  # fmt: skip
@@ -113,17 +118,19 @@ def test_what_both_views_call_a_device_goes_if_without_both_they_agree_better(sa
 def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before, share, back):
     whole = crossed(0.0)
     lost = without_line(view_of(VESSEL, CROSSING), view_of(CROSSING).skeleton)
-    views = [dataclasses.replace(lost, kept=lambda: whole), crossed(0.0)]
+    views = [dataclasses.replace(lost, kept=lambda: whole), crossed(0.0, 90.0)]
     assert not there(views[0]) and there(whole)
 
     def estimate(tried):
         return poses(share * before if there(tried[0]) else before)
 
-    kept, found = partnered(views, estimate(views), (True, False), ENOUGH, estimate, never)
+    kept, found = partnered(
+        views, estimate(views), (True, False), ENOUGH, CONTRADICT, estimate, never
+    )
     assert there(kept[0]) == back and kept[1] is views[1]
     assert found[1].after == (share * before if back else before)
     # A picture whose mask the user gave is left alone.
-    left = partnered(views, estimate(views), (False, False), ENOUGH, estimate, never)[0]
+    left = partnered(views, estimate(views), (False, False), ENOUGH, CONTRADICT, estimate, never)[0]
     assert left[0] is views[0]
 
 
@@ -138,7 +145,7 @@ def test_what_comes_from_outside_in_two_views_is_a_catheter(both):
     def estimate(tried):
         return poses(0.5 * AGREED if there(tried[0]) else AGREED)
 
-    kept, _ = partnered(views, estimate(views), (True, True), ENOUGH, estimate, never)
+    kept, _ = partnered(views, estimate(views), (True, True), ENOUGH, CONTRADICT, estimate, never)
     assert there(kept[0]) is not both
 
 
@@ -167,7 +174,7 @@ def test_of_three_and_more_views_what_agrees_best_where_they_stand_is_fitted(cou
         return agreed(tried)
 
     start = poses(AGREED)
-    kept, found = partnered(views, start, (True,) * count, ENOUGH, estimate, judge)
+    kept, found = partnered(views, start, (True,) * count, ENOUGH, CONTRADICT, estimate, judge)
     assert where(kept) == [3] and found[1].after == pytest.approx(0.5 * AGREED + 0.001)
     # The second round has a view less to ask.
     assert len(placed) == sum(ways) and len(fitted) == 2 * MOST_FITTED
