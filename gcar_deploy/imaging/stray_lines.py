@@ -30,6 +30,8 @@ BORDER_MM = 4.0
 _FILLED_MM, WIDER = (3.0, 15.0), 1.3
 #: the vessel beyond an inlet is asked for its width over so much, mm
 _INLET_MM = 4.0
+#: a stretch of the tree that is so probably a device is a line of its own
+INSIDE = 0.5
 #: side branches shorter than this are spurs; lines shorter than this move nothing; longest, mm
 SPUR_MM, SHORTEST_MM, LONGEST_MM = 6.0, 8.0, 160.0
 #: a line goes on through a fork where it turns by no more than this over so much of its way
@@ -58,12 +60,12 @@ def stray_lines(view: VesselImage) -> Iterator[Mask]:
             continue
         path, spurs = graph.walk(end, SPUR_MM * px, LONGEST_MM * px)
         if len(path) >= SHORTEST_MM * px:
-            yield _drawn(line, [*path, *spurs])
+            yield drawn(line, [*path, *spurs])
         if near[end] and (inlet := _inlet(path, half, px)) is not None:
-            yield _drawn(line, path[:inlet])
+            yield drawn(line, path[:inlet])
         further = _straight_on(graph, path, px)
         if len(further) >= len(path) + SHORTEST_MM * px:
-            yield _drawn(line, further)
+            yield drawn(line, further)
 
 
 def _beside_device(view: VesselImage, px: float) -> Mask:
@@ -206,7 +208,8 @@ def _cosine(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b) / max(float(np.hypot(*a) * np.hypot(*b)), 1e-9)
 
 
-def _drawn(line: Mask, pixels: list[Pixel]) -> Mask:
+def drawn(line: Mask, pixels: list[Pixel]) -> Mask:
+    """(rows, cols) bool: these pixels of a picture as large as ``line``."""
     out = np.zeros_like(line)
     out[tuple(np.transpose(pixels))] = True
     return out

@@ -17,7 +17,7 @@ from gcar_deploy.imaging.widths import by_width, others_too, own_widths
 from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
-from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses
+from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses, worst_of
 from gcar_deploy.pose.partners import GAIN, partnered
 from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
@@ -76,7 +76,7 @@ def agreeing(
             seen, poses, asked, limits.parts_disagreement_raw, limits.good_disagreement_raw,
             estimate, judge,
         )  # fmt: skip
-        if max(p.after for p in closer) <= limits.good_disagreement_raw:
+        if worst_of(closer) <= limits.good_disagreement_raw:
             return fewer, closer, _changed(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.
     return _by_width(views, asked, options) or (list(seen), poses, [])
@@ -94,7 +94,7 @@ def _with_widths(
     if all(one is view for one, view in zip(own, views, strict=True)):
         return views, poses
     closer = estimate(own)
-    if max(p.after for p in closer) >= GAIN * max(p.after for p in poses):
+    if worst_of(closer) >= GAIN * worst_of(poses):
         return views, poses
     _log.info("the views agree far better where widths have a word about path lengths")
     return [others_too(view) if may else view for view, may in zip(own, asked, strict=True)], closer
@@ -128,7 +128,7 @@ def _by_width(
     """
     drawn = [by_width(view) if may else view for view, may in zip(views, asked, strict=True)]
     poses = poses_between(drawn, options)
-    if not any(asked) or max(p.after for p in poses) > options.quality.good_disagreement_mask:
+    if not any(asked) or worst_of(poses) > options.quality.good_disagreement_mask:
         return None
     ids = " and ".join(view.view_id for view, may in zip(views, asked, strict=True) if may)
     said = f"view {ids}: contrasts contradict each other; depth is taken from the widths of vessels"
@@ -143,13 +143,13 @@ def _closest(
 
     Who shows less disagrees about less: the disagreement counts by the share of lines that is left.
     """
-    limits, worst = options.quality, max(p.after for p in poses)
+    limits, worst = options.quality, worst_of(poses)
     if worst <= limits.alone_disagreement_raw:
         return views, poses
     whole = views
     for read in readings:
         closer = poses_between(read, options)
-        after, kept = max(p.after for p in closer), _kept(read, whole)
+        after, kept = worst_of(closer), _kept(read, whole)
         if limits.alone_ratio * after < kept * worst:
             _log.info("the views agree better by what one method sees of them, or without rims")
             views, poses, worst = read, closer, after / kept
@@ -299,7 +299,7 @@ def _other_orders(
             swapped = list(views)
             swapped[i] = dataclasses.replace(views[i], carm=views[j].carm)
             swapped[j] = dataclasses.replace(views[j], carm=views[i].carm)
-            out[i, j] = max(pose.after for pose in poses_between(swapped, asked))
+            out[i, j] = worst_of(poses_between(swapped, asked))
     return out
 
 
@@ -308,7 +308,7 @@ def order_of(
 ) -> tuple[list[str], str]:
     """Judge whether two of the pictures may be swapped; see ``check_order``."""
     calibrated = all(view.calibrated for view in views)
-    given = max(pose.after for pose in poses)
+    given = worst_of(poses)
     # More views that agree leave no room for another order, and no time is spent on it.
     if (calibrated or len(views) > 2) and given <= _agreed(views, options):
         return [], ""

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.consistency import BIN_MM, HALF_BINS
 from gcar_deploy.geometry.epipolar import plane_axes, reach_mm, slices_along
-from gcar_deploy.types import Array, Mask, Scalars
+from gcar_deploy.types import Array, Mask, Pixels, Scalars
 
 #: crossings are smoothed over so much across the planes, since hearts move, mm
 SMOOTH_MM = 2.0
@@ -54,11 +54,8 @@ class Surplus:
 
     def _crossings(self, carm: CArm, line: Mask) -> Scalars:
         """(bins,) how often a line crosses the planes of each bin, smoothed."""
-        ends = _steps(line)
-        first, second = (
-            slices_along(self._axes, carm, ends[:, k : k + 2])[0] * self._reach / BIN_MM
-            for k in (0, 2)
-        )
+        pixels, steps = _steps(line)
+        first, second = (slices_along(self._axes, carm, pixels)[0] * self._reach / BIN_MM)[steps]
         middle = (0.5 * (first + second) + HALF_BINS).astype(np.int64)
         at = np.minimum(np.maximum(middle, 0), 2 * HALF_BINS)
         count = np.bincount(at, np.abs(first - second), 2 * HALF_BINS + 1)
@@ -66,10 +63,11 @@ class Surplus:
         return smooth
 
 
-def _steps(line: Mask) -> Array:
-    """(n, 4) (col, row, col, row) of neighbours on a line; round a corner its sides alone.
+def _steps(line: Mask) -> tuple[Pixels, Array]:
+    """(n, 2) (col, row) of a line's pixels, and (2, m) which are neighbours.
 
-    Means over ``STRAIGHT_PX``: a slanted row of pixels goes back and forth across the planes.
+    Places are means over ``STRAIGHT_PX``: a slanted row of pixels goes back and forth across the
+    planes. Round a corner its sides alone count.
     """
     rows, columns = line.shape
     row, col = np.nonzero(line)
@@ -89,6 +87,5 @@ def _steps(line: Mask) -> Array:
         if down and right:
             corner = line[row[there], beside[there]] | line[below[there], col[there]]
             there = there[~corner]
-        other = number[below[there], beside[there]]
-        out.append(np.concatenate([mean[there], mean[other]], axis=1))
-    return np.concatenate(out).astype(np.float64)
+        out.append(np.stack([there, number[below[there], beside[there]]]))
+    return mean.astype(np.float64), np.concatenate(out, axis=1)

@@ -8,8 +8,9 @@ a device from there. None suffices, but their log odds add up.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -17,14 +18,16 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.imaging.line_chains import chains
 from gcar_deploy.imaging.stray_lines import (
+    INSIDE,
     SHORTEST_MM,
     comes_from_outside,
+    drawn,
     likely_devices,
     stray_lines,
     without_line,
 )
 from gcar_deploy.pose.crossings import Surplus
-from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.pose.pairwise import Pose, worst_of
 from gcar_deploy.types import Mask
 
 #: log odds for what the network says (on the log odds of its word), for a surplus of 1, for views
@@ -41,8 +44,8 @@ LEAST_ODDS = 0.85
 #: so many of the likeliest are asked for how well the views agree without them, none of which the
 #: other witnesses think so little
 MOST_ASKED, LEAST_ASKED = 6, -3.0
-#: a stretch of the tree that is so probably a device is a line of its own
-_INSIDE = 0.5
+#: disagreements below this are no better than it
+_NOTHING = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,40 +54,53 @@ class Line:
 
     Attributes
     ----------
+    view : VesselImage that shows it
     pixels : (rows, cols) bool part of the view's skeleton
     left : the view without it
-    said : 0 .. 1, what the network of devices says
-    outside : whether it reaches the border of the field
     """
 
+    view: VesselImage
     pixels: Mask
     left: VesselImage
-    said: float
-    outside: bool
+
+    @functools.cached_property
+    def said(self) -> float:
+        """0 .. 1, what the network of devices says; 0 where it was not asked."""
+        device = self.view.device
+        return 0.0 if device is None else float(device[self.pixels].mean())
+
+    @functools.cached_property
+    def outside(self) -> bool:
+        """Whether it reaches the border of the field."""
+        return comes_from_outside(self.view, self.pixels)
+
+
+def left_out(view: VesselImage, parts: Iterable[Mask]) -> Iterator[Line]:
+    """Yield the lines of which something is left of the view without them."""
+    for pixels in parts:
+        left = without_line(view, pixels)
+        if left is not None:
+            yield Line(view, pixels, left)
 
 
 def lines_of(view: VesselImage) -> tuple[Line, ...]:
     """Return all lines of a view that could be left out of it."""
-    found = []
-    for pixels in _parts(view):
-        left = without_line(view, pixels)
-        # Where lines lie side by side nothing may go with one of them.
-        if left is None or left.skeleton.sum() > view.skeleton.sum() - 0.5 * pixels.sum():
-            continue
-        said = 0.0 if view.device is None else float(view.device[pixels].mean())
-        found.append(Line(pixels, left, said, comes_from_outside(view, pixels)))
-    return tuple(found)
+    length = view.skeleton.sum()
+    # Where lines lie side by side nothing may go with one of them.
+    return tuple(
+        line
+        for line in left_out(view, _parts(view))
+        if line.left.skeleton.sum() <= length - 0.5 * line.pixels.sum()
+    )
 
 
 def _parts(view: VesselImage) -> Iterator[Mask]:
     yield from stray_lines(view)
-    yield from likely_devices(view, _INSIDE)
+    yield from likely_devices(view, INSIDE)
     least = SHORTEST_MM / view.carm.pixel_at_isocenter_mm
     for chain in chains(view.skeleton, (2 * exact_distance(view.mask)).astype(np.float32)):
         if len(chain) >= least:
-            pixels = np.zeros_like(view.skeleton)
-            pixels[tuple(np.transpose(chain))] = True
-            yield pixels
+            yield drawn(view.skeleton, chain)
 
 
 def without_likeliest(
@@ -129,7 +145,7 @@ def without_likeliest(
             break
         fewer = [line.left if j == k else view for j, view in enumerate(views)]
         closer = estimate(fewer)
-        better = AGREE * math.log((worst(poses) + 1e-3) / (worst(closer) + 1e-3))
+        better = AGREE * math.log((worst_of(poses) + _NOTHING) / (worst_of(closer) + _NOTHING))
         odds += min(better, MOST_AGREE)
         if odds > best:
             best, out = odds, (fewer, closer)
@@ -139,9 +155,4 @@ def without_likeliest(
 def _odds(line: Line, surplus: float, device_elsewhere: bool) -> float:
     """Log odds of a line without what the views say when it is gone."""
     said = math.log((line.said + DOUBT) / (1.0 + DOUBT - line.said))
-    return SAID * said + SURPLUS * surplus + OUTSIDE * (line.outside and device_elsewhere)
-
-
-def worst(poses: Sequence[Pose]) -> float:
-    """Worst disagreement of any view, 0 .. 1."""
-    return max(pose.after for pose in poses)
+    return SAID * said + SURPLUS * surplus + OUTSIDE * (device_elsewhere and line.outside)

@@ -137,6 +137,11 @@ class Pose:
         return np.array([*self.offset_mm, self.primary_deg, self.secondary_deg])
 
 
+def worst_of(poses: Sequence[Pose]) -> float:
+    """Worst disagreement of any view with its partner after the corrections, 0 .. 1."""
+    return max(pose.after for pose in poses)
+
+
 def estimate_poses(
     views: Sequence[tuple[CArm, Image]],
     options: PoseOptions,

@@ -20,16 +20,16 @@ import numpy as np
 
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.stray_lines import (
+    INSIDE,
     comes_from_outside,
     likely_devices,
     lost_lines,
     shows_device,
     stray_lines,
     with_line,
-    without_line,
 )
-from gcar_deploy.pose.odds import lines_of, without_likeliest, worst
-from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.pose.odds import left_out, lines_of, without_likeliest
+from gcar_deploy.pose.pairwise import Pose, worst_of
 from gcar_deploy.types import Mask
 
 #: what is changed of what the pictures show lowers the disagreement to this share at least
@@ -38,9 +38,9 @@ GAIN = 0.85
 #: 119 lines of devices in generated cath-lab pairs (seeds 7900 and 9100) none lowers it to less
 #: than 0.84; of 31 true branches that were taken away 25 lower it to less than this when put back
 BACK_GAIN = 0.75
-#: a line from outside that is so probably a device, or a stretch of the tree that is so, goes
-#: where the views agree a little better without it
-LIKELY, INSIDE, LIKELY_GAIN = 0.5, 0.5, 0.95
+#: what is so probably a device, or comes from outside as a device in another view does, goes where
+#: the views agree a little better without it
+LIKELY, LIKELY_GAIN = 0.5, 0.95
 #: at least this share of a view's line stays
 KEPT_SHARE = 0.5
 #: of a view's lines the longest are asked
@@ -86,7 +86,7 @@ def partnered(
     has_device, every_line = functools.cache(shows_device), functools.cache(lines_of)
     gone = [np.zeros_like(view.mask) for view in views]
     while True:
-        left = worst(poses)
+        left = worst_of(poses)
         devices = [has_device(view) for view in now]
         fewer = [
             fewer_of(view, few, any(devices[:k] + devices[k + 1 :])) if may else ()
@@ -102,15 +102,17 @@ def partnered(
         gain = GAIN if left > enough else BACK_GAIN
         # What went by its odds stays away, or it would come and go for ever.
         lost = [
-            [one for one in more_of(view) if not _of(one[0].mask & ~view.mask, out)] if may else ()
+            [one for one in more_of(view) if not _mostly(one[0].mask & ~view.mask, out)]
+            if may
+            else ()
             for view, may, out in zip(now, asked, gone, strict=True)
         ]
         tried += [(each, gain) for each in _one_of(now, _back(lost))]
         if len(now) > 2:
-            tried.sort(key=lambda one: worst(judge(one[0], poses)) / one[1])
+            tried.sort(key=lambda one: worst_of(judge(one[0], poses)) / one[1])
             del tried[MOST_FITTED:]
         fitted = [estimate(each) for each, _ in tried]
-        after = [worst(some) / gain for some, (_, gain) in zip(fitted, tried, strict=True)]
+        after = [worst_of(some) / gain for some, (_, gain) in zip(fitted, tried, strict=True)]
         if after and min(after) <= left:
             best = after.index(min(after))
             now, poses = tried[best][0], fitted[best]
@@ -128,8 +130,8 @@ def partnered(
     return now, poses
 
 
-def _of(part: Mask, whole: Mask) -> bool:
-    """Whether most of a part is of the whole."""
+def _mostly(part: Mask, whole: Mask) -> bool:
+    """Whether most of a part lies in the whole."""
     return bool(2 * np.count_nonzero(part & whole) > np.count_nonzero(part))
 
 
@@ -154,14 +156,11 @@ def _fewer(view: VesselImage, least_px: float, elsewhere: bool) -> list[tuple[Ve
     """
     lines = _longest(stray_lines(view))
     lines += list(likely_devices(view, INSIDE))
-    found = []
-    for line in lines:
-        left = without_line(view, line)
-        if left is not None and left.skeleton.sum() >= least_px:
-            said = 0.0 if view.device is None else float(view.device[line].mean())
-            likely = elsewhere and comes_from_outside(view, line)
-            found.append((left, likely or said >= LIKELY))
-    return found
+    return [
+        (line.left, (elsewhere and line.outside) or line.said >= LIKELY)
+        for line in left_out(view, lines)
+        if line.left.skeleton.sum() >= least_px
+    ]
 
 
 def _more(view: VesselImage) -> list[tuple[VesselImage, bool]]:

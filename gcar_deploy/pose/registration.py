@@ -11,7 +11,7 @@ from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.pose.agreement import agreeing, order_of, with_motion
 from gcar_deploy.pose.bundling import TreeOf, bundled, posed
-from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.pose.pairwise import Pose, worst_of
 from gcar_deploy.pose.significance import asked
 from gcar_deploy.quality import check_asked, check_consistency, check_motion, check_poses, with_hint
 
@@ -43,7 +43,7 @@ class Registered:
     @property
     def disagreement(self) -> float:
         """Worst disagreement of a view with its partner after the corrections, 0 .. 1."""
-        return max(pose.after for pose in self.poses)
+        return worst_of(self.poses)
 
     def pictures(self, angiograms: Sequence[Angiogram]) -> list[Angiogram]:
         """Return the pictures as the views show them: with the motion of the heart undone."""
