@@ -2,29 +2,24 @@
 
 A severe stenosis hides from the extraction of vessels, and the tree is broken where it matters
 most. Two free ends of different parts become one vessel again where each points at the other over
-a short gap, and where every view's own pixels show a line of contrast along the bridge that no
-line beside it comes near. A gap in which nothing is seen stays one: an occlusion is no stenosis.
+a short gap (``tree.facing``), and where every view's own pixels show a line of contrast along the
+bridge that no line beside it comes near. A gap in which nothing is seen stays one: an occlusion is
+no stenosis.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
 from gcar_deploy.measure.signals import Signal
-from gcar_deploy.tree.edit import merged
-from gcar_deploy.tree.tree import Branch, Tree, along, polyline_arc
+from gcar_deploy.tree.facing import DIRECTION_MM, FreeEnd, joined_ends
+from gcar_deploy.tree.tree import Branch, Tree, polyline_arc
 from gcar_deploy.types import Array, Points, Scalars
 
-#: longest gap, mm, and the angle by which either end may point beside the other, degrees
-MOST_GAP_MM, MOST_TURN_DEG = 15.0, 40.0
-#: an end's direction is taken over so much of its branch, mm
-DIRECTION_MM = 4.0
-#: a shorter piece bridges nothing, mm: scraps point anywhere
-LEAST_PIECE_MM = 8.0
+#: longest gap, mm
+MOST_GAP_MM = 15.0
 #: the bridge is looked at in blocks of this length; in each the line may be so far off, mm
 BLOCK_MM, OFF_MM = 2.0, 0.8
 #: half-width of the line looked for, and how far beside it others are tried, mm
@@ -38,97 +33,23 @@ LEAST_SHARE = 0.1
 _STEP_MM = 0.2
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _End:
-    """A free end: node, branch, number of its point, place, direction outwards, widest radius."""
-
-    node: int
-    branch: int
-    point: int
-    place: Points
-    outwards: Points
-    radius_mm: float
-
-
 def joined_over_lesions(tree: Tree, signals: Sequence[Signal]) -> Tree:
     """Join free ends that face each other where every view shows a thin vessel between.
 
     Parameters
     ----------
     tree : Tree, mm LPS
-    signals : of each view (``measure.signals``); masks show nothing in a gap, and join none
+    signals : of each view (``measure.signals``); masks show nothing where no vessel was found,
+        and join none
 
     Returns
     -------
     Tree, the same one where nothing is joined
     """
-    if not tree.branches:
-        return tree
-    ends, component = _free_ends(tree), tree.components()
-    wanted = [
-        (float(np.linalg.norm(b.place - a.place)), a, b)
-        for a, b in itertools.combinations(ends, 2)
-        if component[a.node] != component[b.node] and _face(a, b)
-    ]
-    used: set[int] = set()
-    bridges = []
-    for _, a, b in sorted(wanted, key=lambda item: item[0]):
-        if component[a.node] == component[b.node] or {a.node, b.node} & used:
-            continue
-        line = _curve(a, b)
-        radius = _radii(line, a, b, signals)
-        if radius is None:
-            continue
-        used |= {a.node, b.node}
-        component[component == component[b.node]] = component[a.node]
-        bridges.append(_bridge(tree, a, b, line, radius))
-    if not bridges:
-        return tree
-    return merged(dataclasses.replace(tree, branches=(*tree.branches, *bridges)))
+    return joined_ends(tree, lambda a, b, line: _bridge(tree, a, b, line, signals), MOST_GAP_MM)
 
 
-def _free_ends(tree: Tree) -> list[_End]:
-    degrees, out = tree.degrees, []
-    for k, branch in enumerate(tree.branches):
-        if branch.length_mm < LEAST_PIECE_MM:
-            continue
-        arc = branch.arc_mm
-        for point, node, inner in (
-            (0, branch.start, DIRECTION_MM),
-            (-1, branch.end, arc[-1] - DIRECTION_MM),
-        ):
-            if degrees[node] == 1:
-                way = branch.points_mm[point] - along(branch.points_mm, arc, np.array(inner))
-                way /= max(float(np.linalg.norm(way)), 1e-9)
-                near = np.abs(arc - arc[point]) <= DIRECTION_MM
-                radius = float(branch.radius_mm[near].max())
-                out.append(_End(node, k, point, branch.points_mm[point], way, radius))
-    return out
-
-
-def _face(a: _End, b: _End) -> bool:
-    way = b.place - a.place
-    gap = float(np.linalg.norm(way))
-    if not 0 < gap <= MOST_GAP_MM or max(a.radius_mm, b.radius_mm) > 2 * min(
-        a.radius_mm, b.radius_mm
-    ):
-        return False
-    least = np.cos(np.radians(MOST_TURN_DEG))
-    return bool(a.outwards @ way >= least * gap and -(b.outwards @ way) >= least * gap)
-
-
-def _curve(a: _End, b: _End) -> Points:
-    """(m, 3) Hermite's cubic from one end to the other."""
-    gap = float(np.linalg.norm(b.place - a.place))
-    t = np.linspace(0, 1, max(5, int(np.ceil(gap / 0.5)) + 1))[:, None]
-    out: Points = (
-        (2 * t**3 - 3 * t**2 + 1) * a.place + (t**3 - 2 * t**2 + t) * gap * a.outwards
-        + (3 * t**2 - 2 * t**3) * b.place - (t**3 - t**2) * gap * b.outwards
-    )  # fmt: skip
-    return out
-
-
-def _radii(line: Points, a: _End, b: _End, signals: Sequence[Signal]) -> Scalars | None:
+def _radii(line: Points, a: FreeEnd, b: FreeEnd, signals: Sequence[Signal]) -> Scalars | None:
     """(m,) radius along a bridge by the contrast against the ends; None where it is not seen."""
     seen = [found for signal in signals if (found := _seen(line, a, b, signal)) is not None]
     if len(seen) < len(signals):
@@ -141,7 +62,7 @@ def _radii(line: Points, a: _End, b: _End, signals: Sequence[Signal]) -> Scalars
     return out
 
 
-def _seen(line: Points, a: _End, b: _End, signal: Signal) -> tuple[float, Scalars] | None:
+def _seen(line: Points, a: FreeEnd, b: FreeEnd, signal: Signal) -> tuple[float, Scalars] | None:
     """Contrast over its spread beside the bridge, and (m,) over that of the ends; None without."""
     if signal.kind == "mask":
         return None
@@ -181,7 +102,7 @@ def _seen(line: Points, a: _End, b: _End, signal: Signal) -> tuple[float, Scalar
     return float((total[middle] - np.median(total[beside])) / max(spread, 1e-9)), out
 
 
-def _back(end: _End) -> Points:
+def _back(end: FreeEnd) -> Points:
     """(4, 3) places on the vessel before an end."""
     return end.place - np.linspace(DIRECTION_MM, 1.0, 4)[:, None] * end.outwards
 
@@ -211,8 +132,13 @@ def _contrast(line: Points, signal: Signal) -> Array | None:
     return out[:, side + half : -(side + half)]
 
 
-def _bridge(tree: Tree, a: _End, b: _End, line: Points, radius_mm: Scalars) -> Branch:
-    """Return the branch between two ends; nobody fitted its place."""
+def _bridge(
+    tree: Tree, a: FreeEnd, b: FreeEnd, line: Points, signals: Sequence[Signal]
+) -> Branch | None:
+    """Return the branch between two ends, whose place nobody fitted; None where none is seen."""
+    radius_mm = _radii(line, a, b, signals)
+    if radius_mm is None:
+        return None
     first, second = tree.branches[a.branch], tree.branches[b.branch]
     m, own = len(line), OFF_MM * np.sin(np.linspace(0, np.pi, len(line)))
     sigma = np.linspace(first.sigma_mm[a.point], second.sigma_mm[b.point], m)

@@ -24,6 +24,7 @@ from gcar_deploy.tubes.choice import (
     reinstated,
     weigh_pieces,
 )
+from gcar_deploy.tubes.gaps import joined_in_pictures
 from gcar_deploy.tubes.gauss_newton import (
     Progress,
     fit_level,
@@ -93,7 +94,7 @@ def fit_tubes(
     if should_stop is not None:
         # Whoever cancelled raises here; a deadline is heeded by the first step.
         should_stop()
-    tree = build_tree(settled_centers, len(views))
+    tree = joined_in_pictures(build_tree(settled_centers, len(views)), views)
     fit = TubeFit(
         tree=tree,
         centers=settled_centers,

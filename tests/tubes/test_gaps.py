@@ -1,0 +1,127 @@
+"""Gaps of a tree are bridged where every picture shows vessel in them, and nowhere else."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gcar_deploy.engine import Engine
+from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes.gaps import joined_in_pictures
+from tests.tree.shapes import branch
+from tests.tubes.scenes import seen, two_views
+
+ANGLE = np.linspace(-0.7, 0.7, 141)
+#: an arc of 40 mm radius, 56 mm long
+LINE = 40.0 * np.stack([np.sin(ANGLE), np.cos(ANGLE) - 0.9, 0.5 * np.sin(ANGLE)], axis=1)
+ARC = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(LINE, axis=0), axis=1))])
+
+
+def vessel(line=LINE, radius=1.5):
+    tube = branch(line, np.broadcast_to(radius, len(line)), 0, 1)
+    return Tree(nodes_mm=line[[0, -1]], branches=(tube,))
+
+
+def narrowed(least, length_mm=8.0):
+    off = np.clip(2 * np.abs(ARC - ARC[70]) / length_mm, 0, 1)
+    return 1.5 - (1.5 - least) * 0.5 * (1 + np.cos(np.pi * off))
+
+
+def broken(first=60, second=80, shift=0.0):
+    before, after = LINE[: first + 1], LINE[second:] + shift
+    return Tree(
+        nodes_mm=np.concatenate([before[[0, -1]], after[[0, -1]]]),
+        branches=(
+            branch(before, np.full(len(before), 1.5), 0, 1),
+            branch(after, np.full(len(after), 1.3), 2, 3),
+        ),
+    )
+
+
+def test_vessel_in_every_picture_makes_one_tube():
+    views = seen(vessel(radius=narrowed(0.3)), two_views())
+    tree = joined_in_pictures(broken(), views)
+    (whole,) = tree.branches
+    assert whole.length_mm == pytest.approx(ARC[-1], rel=0.01)
+    assert cKDTree(LINE).query(whole.points_mm)[0].max() < 0.5
+    assert np.diff(whole.arc_mm).max() < 1.0
+    assert len(tree.nodes_mm) == 2 and set(tree.degrees) == {1}
+    inside = (whole.arc_mm > ARC[61]) & (whole.arc_mm < ARC[79])
+    assert inside.any() and (np.abs(whole.radius_mm[inside] - 1.4) <= 0.1 + 1e-9).all()
+
+
+@pytest.mark.parametrize("blind", [0, 1])
+def test_a_break_of_a_thin_lumen_in_one_picture_is_none(blind):
+    views = seen(vessel(radius=narrowed(0.3)), two_views())
+    columns, rows = np.meshgrid(np.arange(256), np.arange(256))
+    ((column, row),) = views[blind].carm.project(LINE[70:71])[0]
+    mask = views[blind].mask & (np.hypot(columns - column, rows - row) > 2.0)
+    assert mask.sum() < views[blind].mask.sum()
+    views[blind] = dataclasses.replace(views[blind], mask=mask)
+    assert len(joined_in_pictures(broken(), views).branches) == 1
+
+
+@pytest.mark.parametrize("blind", [0, 1])
+def test_a_gap_in_one_picture_stays_one(blind):
+    tree = broken(56, 84)
+    whole, gap = seen(vessel(), two_views()), seen(tree, two_views())
+    views = [gap[k] if k == blind else whole[k] for k in range(2)]
+    assert joined_in_pictures(tree, views) is tree
+
+
+def test_vessel_beside_the_gap_is_another():
+    # Beside it in either picture.
+    rays = [view.source_mm / np.linalg.norm(view.source_mm) for view in two_views()]
+    other = vessel(LINE + 5.0 * np.cross(*rays) / np.linalg.norm(np.cross(*rays)))
+    pictures = [
+        dataclasses.replace(a, mask=a.mask | b.mask)
+        for a, b in zip(seen(broken(), two_views()), seen(other, two_views()), strict=True)
+    ]
+    tree = broken()
+    assert joined_in_pictures(tree, pictures) is tree
+
+
+def test_ends_far_from_each_other_stay_ends():
+    views, near, far = seen(vessel(), two_views()), broken(59, 81), broken(58, 84)
+    assert len(joined_in_pictures(near, views).branches) == 1
+    assert joined_in_pictures(far, views) is far
+
+
+def at_the_border(view):
+    """Move a C-arm until its picture ends within the gap."""
+    for off in np.arange(0.0, 200.0, 2.0):
+        moved = view.moved((-off, 0.0, 0.0))
+        inside = ((moved.project(LINE)[0] >= 0) & (moved.project(LINE)[0] < 256)).all(axis=1)
+        if inside[60] != inside[80]:
+            return moved
+    raise AssertionError("no such place")
+
+
+def test_a_gap_at_the_border_of_a_picture_stays_one():
+    views = seen(vessel(), [at_the_border(view) for view in two_views()])
+    tree = broken()
+    assert joined_in_pictures(tree, views) is tree
+
+
+@pytest.mark.parametrize("least", [0.2, 0.3])
+def test_a_tight_stenosis_of_two_masks_is_found(least):
+    truth = vessel(radius=narrowed(least))
+    pictures = [
+        Angiogram(
+            view_id=view.view_id, carm=view.carm, bit_depth=8, sha256=view.view_id,
+            pixels=np.float32(255) * (view.path_mm > 0.02),
+            intensity=Intensity(kind="mask", polarity="bright"),
+        )
+        for view in seen(truth, two_views(512, 0.2))
+    ]  # fmt: skip
+    grid = Grid(center_mm=(0, 0, 0), size_mm=(96, 96, 96), shape=(96, 96, 96))
+    result = Engine().reconstruct(pictures, grid)
+    (tube,) = result.tree.branches
+    assert tube.length_mm > ARC[-1] - 4.0
+    (lumen,) = result.measured.lumens
+    assert lumen.sections.diameter_mm.min() == pytest.approx(2 * least, abs=0.25)
+    assert lumen.stenosis_percent == pytest.approx(100 * (1 - least / 1.5), abs=9.0)
