@@ -8,16 +8,18 @@ the other, it is one tube from the start. Where it is broken in some picture, th
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
+from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.tree.facing import FreeEnd, joined_ends
 from gcar_deploy.tree.tree import Branch, Tree
-from gcar_deploy.types import Points
+from gcar_deploy.types import Image, Points
 
 #: longest gap, mm: in a longer one the curve from end to end is a guess
 MOST_GAP_MM = 10.0
@@ -42,8 +44,12 @@ def joined_in_pictures(tree: Tree, views: Sequence[VesselImage]) -> Tree:
     Tree, the same one where nothing is joined; radii run evenly from end to end
     """
 
+    @functools.cache
+    def beside(k: int) -> Image:
+        return exact_distance(~views[k].mask)
+
     def bridge(a: FreeEnd, b: FreeEnd, line: Points) -> Branch | None:
-        if not all(_runs_on(line, view) for view in views):
+        if not all(_runs_on(line, view.carm, beside(k)) for k, view in enumerate(views)):
             return None
         m = len(line)
         return Branch(
@@ -55,19 +61,22 @@ def joined_in_pictures(tree: Tree, views: Sequence[VesselImage]) -> Tree:
     return joined_ends(tree, bridge, MOST_GAP_MM)
 
 
-def _runs_on(line: Points, view: VesselImage) -> bool:
-    """Whether a picture's vessel goes on from one end of a line to the other, near it all along."""
-    pixels, depth = view.carm.project(line)
-    inside = (pixels >= 0).all() and (pixels < view.mask.shape[::-1]).all()
+def _runs_on(line: Points, carm: CArm, beside: Image) -> bool:
+    """Whether a picture's vessel goes on from one end of a line to the other, near it all along.
+
+    ``beside`` is each pixel's distance from vessel.
+    """
+    pixels, depth = carm.project(line)
+    inside = (pixels >= 0).all() and (pixels < beside.shape[::-1]).all()
     if not (inside and (depth > 1.0).all()):
         return False
-    per_mm = np.sqrt(np.prod(view.carm.focal_px)) / depth.mean()
+    per_mm = np.sqrt(np.prod(carm.focal_px)) / depth.mean()
     wide = round(2 * OFF_MM * per_mm)
-    near = np.zeros(view.mask.shape, np.uint8)
+    near = np.zeros(beside.shape, np.uint8)
     course = np.rint(pixels).astype(np.int32)
     cv2.polylines(near, [course], isClosed=False, color=1, thickness=max(wide, 1))
     # Within so much of vessel on either side a break is none.
-    near[exact_distance(~view.mask) > 0.5 * BREAK_MM * per_mm] = 0
+    near[beside > 0.5 * BREAK_MM * per_mm] = 0
     parts = cv2.connectedComponents(near, connectivity=8)[1]
     shown = np.stack(np.nonzero(parts)[::-1], axis=1)
     if not len(shown):
