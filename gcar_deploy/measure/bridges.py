@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gcar_deploy.measure.signals import Signal
+from gcar_deploy.tree.edit import UNTOLD
 from gcar_deploy.tree.facing import DIRECTION_MM, FreeEnd, joined_ends
 from gcar_deploy.tree.tree import Branch, Tree, polyline_arc
 from gcar_deploy.types import Array, Points, Scalars
@@ -150,6 +151,6 @@ def _bridge(
         covariance[:, 0] += own[:, None, None] ** 2 * np.eye(3)
     return Branch(
         points_mm=line, radius_mm=radius_mm, sigma_mm=np.hypot(sigma, own),
-        confidence=np.full(m, 0.1), start=a.node, end=b.node,
+        confidence=np.full(m, UNTOLD), start=a.node, end=b.node,
         covariance_mm2=covariance,
     )  # fmt: skip

@@ -14,6 +14,8 @@ from gcar_deploy.types import Array, Points
 _PER_POINT = ("points_mm", "radius_mm", "sigma_mm", "confidence")
 #: points of a new branch are so far apart, mm
 NEW_STEP_MM = 1.0
+#: confidence of points that no predictor told of
+UNTOLD = 0.1
 
 
 def kept_branches(tree: Tree, keep: Array) -> Tree:

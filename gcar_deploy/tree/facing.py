@@ -59,14 +59,14 @@ def joined_ends(tree: Tree, bridge: Bridge, most_gap_mm: float) -> Tree:
         for a, b in itertools.combinations(ends, 2)
         if (gap := float(np.linalg.norm(b.place - a.place))) <= most_gap_mm
         and component[a.node] != component[b.node]
-        and _face(a, b)
+        and _face(a, b, gap)
     ]
     used: set[int] = set()
     bridges = []
-    for _, a, b in sorted(wanted, key=lambda item: item[0]):
+    for gap, a, b in sorted(wanted, key=lambda item: item[0]):
         if component[a.node] == component[b.node] or {a.node, b.node} & used:
             continue
-        made = bridge(a, b, _curve(a, b))
+        made = bridge(a, b, _curve(a, b, gap))
         if made is None:
             continue
         used |= {a.node, b.node}
@@ -96,18 +96,16 @@ def _free_ends(tree: Tree) -> list[FreeEnd]:
     return out
 
 
-def _face(a: FreeEnd, b: FreeEnd) -> bool:
+def _face(a: FreeEnd, b: FreeEnd, gap: float) -> bool:
     way = b.place - a.place
-    gap = float(np.linalg.norm(way))
     if gap == 0 or max(a.radius_mm, b.radius_mm) > 2 * min(a.radius_mm, b.radius_mm):
         return False
     least = np.cos(np.radians(MOST_TURN_DEG))
     return bool(a.outwards @ way >= least * gap and -(b.outwards @ way) >= least * gap)
 
 
-def _curve(a: FreeEnd, b: FreeEnd) -> Points:
+def _curve(a: FreeEnd, b: FreeEnd, gap: float) -> Points:
     """(m, 3) Hermite's cubic from one end to the other."""
-    gap = float(np.linalg.norm(b.place - a.place))
     t = np.linspace(0, 1, max(5, int(np.ceil(gap / STEP_MM)) + 1))[:, None]
     out: Points = (
         (2 * t**3 - 3 * t**2 + 1) * a.place + (t**3 - 2 * t**2 + t) * gap * a.outwards

@@ -17,6 +17,7 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.distance import exact_distance
+from gcar_deploy.tree.edit import UNTOLD
 from gcar_deploy.tree.facing import FreeEnd, joined_ends
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Image, Points
@@ -27,8 +28,6 @@ MOST_GAP_MM = 10.0
 OFF_MM = 1.5
 #: a lumen thinner than a pixel comes and goes: a shorter break of a picture's vessel is none, mm
 BREAK_MM = 2.0
-#: of points that no predictor told of
-CONFIDENCE = 0.1
 
 
 def joined_in_pictures(tree: Tree, views: Sequence[VesselImage]) -> Tree:
@@ -54,7 +53,7 @@ def joined_in_pictures(tree: Tree, views: Sequence[VesselImage]) -> Tree:
         m = len(line)
         return Branch(
             points_mm=line, radius_mm=np.linspace(a.radius_mm, b.radius_mm, m),
-            sigma_mm=np.full(m, np.nan), confidence=np.full(m, CONFIDENCE),
+            sigma_mm=np.full(m, np.nan), confidence=np.full(m, UNTOLD),
             start=a.node, end=b.node,
         )  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.tree.edit import kept_branches, part_of, with_ends_moved
+from gcar_deploy.tree.edit import UNTOLD, kept_branches, part_of, with_ends_moved
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Footprint, Tubes
 from gcar_deploy.tubes.targets import Target
@@ -133,7 +133,7 @@ def _lengthened(branch: Branch, new: Points, radius: float, at_end: bool) -> Bra
         points_mm=joined(branch.points_mm, new),
         radius_mm=joined(branch.radius_mm, np.full(count, radius)),
         sigma_mm=joined(branch.sigma_mm, np.full(count, np.nan)),
-        confidence=joined(branch.confidence, np.full(count, 0.1)),
+        confidence=joined(branch.confidence, np.full(count, UNTOLD)),
     )
 
 

@@ -31,8 +31,8 @@ def narrowed(least, length_mm=8.0):
     return 1.5 - (1.5 - least) * 0.5 * (1 + np.cos(np.pi * off))
 
 
-def broken(first=60, second=80, shift=0.0):
-    before, after = LINE[: first + 1], LINE[second:] + shift
+def broken(first=60, second=80):
+    before, after = LINE[: first + 1], LINE[second:]
     return Tree(
         nodes_mm=np.concatenate([before[[0, -1]], after[[0, -1]]]),
         branches=(
