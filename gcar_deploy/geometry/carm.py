@@ -273,6 +273,11 @@ class CArm:
         """Geometric mean of the pixel's two sides, scaled back to the isocentre, mm."""
         return math.sqrt(self.pixel_spacing_mm[0] * self.pixel_spacing_mm[1]) / self.magnification
 
+    def px_per_mm(self, depth_mm: Scalars) -> Scalars:
+        """Pixels to a mm across the ray at depths of any shape, geometric mean of both axes."""
+        out: Scalars = math.sqrt(math.prod(self.focal_px)) / np.maximum(depth_mm, 1.0)
+        return out
+
     # -- points and rays ------------------------------------------------------------------
 
     def project(self, points_mm: Points) -> tuple[Pixels, Scalars]:
@@ -320,13 +325,8 @@ class CArm:
         c0, r0 = self.principal_point
         matrix = None
         if self.projection_matrix is not None:
-            S = np.array(
-                [
-                    [scale_col, 0, 0.5 * scale_col - 0.5],
-                    [0, scale_row, 0.5 * scale_row - 0.5],
-                    [0, 0, 1],
-                ]
-            )
+            S = np.array([[scale_col, 0, 0.5 * scale_col - 0.5],
+                          [0, scale_row, 0.5 * scale_row - 0.5], [0, 0, 1]])  # fmt: skip
             matrix = tuple(map(tuple, (S @ np.asarray(self.projection_matrix)).tolist()))
         return dataclasses.replace(
             self,

@@ -117,7 +117,7 @@ def _contrast(line: Points, signal: Signal) -> Array | None:
     ahead = np.gradient(pixels, axis=0)
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-    per_mm = np.sqrt(np.prod(carm.focal_px)) / depth
+    per_mm = carm.px_per_mm(depth)
     far = BESIDE_MM + OFF_MM + 4 * HALF_MM
     count = int(np.ceil(far / _STEP_MM))
     x = np.arange(-count, count + 1) * _STEP_MM

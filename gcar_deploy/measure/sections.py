@@ -184,7 +184,7 @@ def _places_of(branch: Branch) -> tuple[Points, Points, Scalars, Scalars]:
 def _seen(places: _Places, signal: Signal) -> _Seen:
     carm = signal.carm
     pixels, depth = carm.project(places.points_mm)
-    per_mm = np.sqrt(np.prod(carm.focal_px)) / np.maximum(depth, 1.0)
+    per_mm = carm.px_per_mm(depth)
     ray = places.points_mm - carm.source_mm
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     cosine = np.abs(np.einsum("ij,ij->i", ray, places.tangents))

@@ -69,7 +69,7 @@ def _runs_on(line: Points, carm: CArm, beside: Image) -> bool:
     inside = (pixels >= 0).all() and (pixels < beside.shape[::-1]).all()
     if not (inside and (depth > 1.0).all()):
         return False
-    per_mm = np.sqrt(np.prod(carm.focal_px)) / depth.mean()
+    per_mm = float(carm.px_per_mm(depth.mean()))
     wide = round(2 * OFF_MM * per_mm)
     near = np.zeros(beside.shape, np.uint8)
     course = np.rint(pixels).astype(np.int32)

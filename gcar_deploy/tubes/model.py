@@ -13,7 +13,6 @@ Where tubes overlap in space, a ray's intervals through them are united, not add
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 
@@ -153,7 +152,7 @@ def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None =
         From an earlier call; used where the tubes have moved little since.
     """
     pixels, depth = carm.project(tubes.points_mm)
-    per_mm = math.sqrt(math.prod(carm.focal_px)) / np.maximum(depth, 1.0)
+    per_mm = carm.px_per_mm(depth)
     reach = tubes.radius_mm * per_mm + 0.5 * box_px
     i, j = tubes.first, tubes.second
     if pairing is None or not pairing.fits(pixels, reach):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,15 @@ def test_jacobian_against_central_differences(carm, X):
         step = h * np.eye(3)[k]
         slope = (carm.project(X + step)[0] - carm.project(X - step)[0]) / (2 * h)
         np.testing.assert_allclose(J[:, :, k], slope, atol=1e-7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(arms, st.floats(-60, 60))
+def test_pixels_to_a_mm_are_the_jacobians_on_the_central_ray(carm, ahead):
+    place = carm.source_mm + (carm.sod_mm + ahead) * carm.axes[2]
+    (J,), (_, depth) = carm.jacobian(place[None]), carm.project(place[None])
+    area = math.sqrt(np.linalg.det(J @ J.T))
+    assert carm.px_per_mm(depth) ** 2 == pytest.approx(area, rel=1e-9)
 
 
 @settings(max_examples=40, deadline=None)
