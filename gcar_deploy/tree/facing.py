@@ -13,7 +13,7 @@ from gcar_deploy.tree.tree import Branch, Tree, along
 from gcar_deploy.types import Points
 
 #: either end may point so far beside the other, degrees
-MOST_TURN_DEG = 40.0
+MOST_TURN_DEG = 50.0
 #: an end's direction is taken over so much of its branch, mm
 DIRECTION_MM = 4.0
 #: a shorter piece bridges nothing, mm: scraps point anywhere

@@ -91,6 +91,33 @@ def test_ends_far_from_each_other_stay_ends():
     assert joined_in_pictures(far, views) is far
 
 
+def bent(half_deg):
+    """Straight for 25 mm on both sides of a bend of 5 mm radius; halves end before and after it."""
+    turn = np.radians(np.linspace(-half_deg, half_deg, 41))
+    bend = 5.0 * np.stack([np.sin(turn), np.cos(turn), np.zeros(41)], axis=1)
+    along = np.linspace(25.0, 0.25, 100)[:, None]
+    before = bend[0] - along * [np.cos(turn[-1]), np.sin(turn[-1]), 0.0]
+    after = bend[-1] + along[::-1] * [np.cos(turn[-1]), -np.sin(turn[-1]), 0.0]
+    halves = tuple(
+        branch(line, np.full(len(line), 0.8), 2 * k, 2 * k + 1)
+        for k, line in enumerate((before, after))
+    )
+    nodes = np.stack([before[0], before[-1], after[0], after[-1]])
+    return vessel(np.concatenate([before, bend, after]), 0.8), Tree(nodes_mm=nodes, branches=halves)
+
+
+def test_a_vessel_that_bends_in_its_gap_is_one():
+    whole, halves = bent(45)
+    (found,) = joined_in_pictures(halves, seen(whole, two_views())).branches
+    (line,) = whole.branches
+    assert cKDTree(found.points_mm).query(line.points_mm)[0].max() < 1.0
+
+
+def test_ends_that_point_past_each_other_stay_ends():
+    whole, halves = bent(55)
+    assert joined_in_pictures(halves, seen(whole, two_views())) is halves
+
+
 def at_the_border(view):
     """Move a C-arm until its picture ends within the gap."""
     for off in np.arange(0.0, 200.0, 2.0):
