@@ -71,7 +71,7 @@ def _branch(result: Reconstruction, k: int, stride: int) -> dict[str, Any]:
         if lumen.minimal_at_mm is None
         else [round(lumen.minimal_at_mm, 2), round(lumen.minimal_diameter_mm or 0.0, 2)],
         "stenosis": _one(lumen.stenosis_percent),
-        "lesion": _one(lumen.lesion_length_mm),
+        "lesion": None if lumen.lesion_mm is None else np.round(lumen.lesion_mm, 1).tolist(),
     }
 
 

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
 import pytest
 
+from gcar_deploy.config import LesionBorders
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.output.bundle import render_files
+from gcar_deploy.tree.tree import along
 from tests.conftest import PATIENCE_MS
+
+#: where a lesion is marked on a branch, shares of its length
+EIGHTHS = np.array([3, 5]) / 8
 
 
 @pytest.fixture
 def opened(chromium, files, tmp_path):
-    """Call with a width (and touch) for the page; at the end its console must be silent."""
+    """Call with a width (and touch, and another page); at the end its console must be silent."""
     path = tmp_path / "report.html"
-    path.write_bytes(files["report.html"])
     complaints, contexts = [], []
 
-    def open_page(width=1280, touch=False):
+    def open_page(width=1280, touch=False, other=None):
+        path.write_bytes(files["report.html"] if other is None else other)
         context = chromium.new_context(
             viewport={"width": width, "height": 1000}, has_touch=touch, is_mobile=touch
         )
@@ -190,6 +197,26 @@ def test_pictures_are_shown_around_the_tree(opened, result):
         assert chosen == str(second + 1)
     page.select_option("#crop", "whole")
     assert page.locator("figure img").first.bounding_box()["width"] <= shown["width"] + 1
+
+
+@pytest.mark.slow
+def test_the_lesion_that_is_said_is_the_one_that_is_shaded(opened, result):
+    carm, branch = result.views[0].carm, max(result.tree.branches, key=lambda b: b.length_mm)
+    marks = carm.project(along(branch.points_mm, branch.arc_mm, branch.length_mm * EIGHTHS))[0]
+    lesion = LesionBorders(view=1, proximal=tuple(marks[0]), distal=tuple(marks[1]))
+    options = dataclasses.replace(result.options, lesions=(lesion,))
+    marked = dataclasses.replace(result, options=options)
+    page = opened(other=render_files(marked)["report.html"])
+    (lumen,) = (one for one in marked.measured.lumens if one.lesion_mm)
+    row = page.locator(f"tbody tr[data-branch='{marked.measured.lumens.index(lumen) + 1}']")
+    row.click()
+    page.mouse.move(5, 5)
+    assert f"lesion {lumen.lesion_length_mm:.1f} mm" in page.text_content("#point")
+    width = page.eval_on_selector("#curve", "e => e.clientWidth")
+    ends = 44 + (width - 54) * np.array(lumen.lesion_mm) / branch.length_mm
+    assert opaque(page, "#curve", [(x, 30) for x in (ends[0] + 3, ends.mean(), ends[1] - 3)])
+    for x in (ends[0] - 3, ends[1] + 3):
+        assert not opaque(page, "#curve", [(x, 30)])
 
 
 @pytest.mark.slow

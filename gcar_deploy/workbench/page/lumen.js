@@ -91,7 +91,10 @@ export class Curve {
     this.frame = { s: px => (px - left) / (right - left) * length };
     this.axes(ctx, { left, right, top, bottom, most, length, x, y });
     for (const { branch, start } of parts) {
-      if (branch.stenosis >= 25) this.lesion(ctx, branch, s => x(start + s), top, bottom);
+      if (branch.lesion) {
+        const [begin, end] = branch.lesion.map(s => x(start + s));
+        ctx.fillStyle = "#d55e0033"; ctx.fillRect(begin, top, Math.max(3, end - begin), bottom - top);
+      }
       ctx.strokeStyle = "#525c6b"; ctx.lineWidth = 1.5; ctx.setLineDash([5, 4]); ctx.beginPath();
       let down = false;
       branch.arc.forEach((s, i) => { const r = branch.reference[i]; if (r !== null) { ctx[down ? "lineTo" : "moveTo"](x(start + s), y(2 * r)); down = true; } });
@@ -123,14 +126,6 @@ export class Curve {
     for (let s = 0; s <= length; s += stride) ctx.fillText(String(s), x(s), bottom + 4);
     ctx.textAlign = "right"; ctx.fillText("mm from the ostium", right, bottom + 18);
     ctx.textAlign = "left"; ctx.fillText("diameter, mm", 4, bottom + 18); ctx.textBaseline = "alphabetic";
-  }
-  lesion(ctx, branch, x, top, bottom) {
-    const narrow = i => branch.reference[i] !== null && branch.radius[i] < 0.75 * branch.reference[i];
-    let first = nearest(branch.arc, branch.least[0]), last = first;
-    while (first > 0 && narrow(first - 1)) first--;
-    while (last + 1 < branch.arc.length && narrow(last + 1)) last++;
-    ctx.fillStyle = "#d55e0033";
-    ctx.fillRect(x(branch.arc[first]), top, Math.max(3, x(branch.arc[last]) - x(branch.arc[first])), bottom - top);
   }
   said({ branch, start }, i) {
     const reference = branch.reference[i], sigma = branch.sigma[i];
