@@ -6,6 +6,7 @@ through are supersampled.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -16,6 +17,10 @@ from gcar_deploy.types import Array, Points, Scalars, Volume
 
 #: samples per voxel edge where the surface passes through.
 SAMPLES = 3
+#: wider voxels are summed up from finer ones: their samples would miss the vessels, mm
+WIDEST_MM = 4.0
+#: unless those were more than a Grid may have
+MOST_FINE = 2**28
 #: capsule-voxel pairs handled at once: what is made of them stays in the cache
 CHUNK = 80_000
 
@@ -41,6 +46,15 @@ def tree_occupancy(tree: Tree, grid: Grid) -> Volume:
 
 def sparse_occupancy(tree: Tree, grid: Grid) -> tuple[Array, Array]:
     """Like ``tree_occupancy``, but only (n,) flat voxel indices and their coverage."""
+    parts = np.ceil(grid.spacing_mm / WIDEST_MM).astype(np.int64)
+    shape = parts * grid.shape
+    if parts.max() > 1 and shape.prod() <= MOST_FINE:
+        fine = dataclasses.replace(grid, shape=tuple(shape.tolist()))
+        voxel, coverage = sparse_occupancy(tree, fine)
+        at = np.stack(np.unravel_index(voxel, fine.shape)) // parts[:, None]
+        whole, slot = np.unique(np.ravel_multi_index(tuple(at), grid.shape), return_inverse=True)
+        share = np.bincount(slot, coverage, len(whole)) / parts.prod()
+        return whole, share.astype(np.float32)
     capsules = tree.segments()
     half_diagonal = 0.5 * float(np.linalg.norm(grid.spacing_mm))
     voxel, capsule, distance = near_pairs(capsules, grid, half_diagonal)

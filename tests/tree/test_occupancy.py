@@ -48,6 +48,15 @@ def test_volume_of_a_tube():
     assert tree_occupancy(tree, grid(64)).sum() == pytest.approx(expected, rel=0.01)
 
 
+def test_voxels_far_wider_than_the_vessel_hold_as_much_of_it():
+    for shape in ((1, 1, 1), (3, 2, 5), (64, 2, 1)):
+        where = Grid(center_mm=(0, 0, 0), size_mm=(64.0,) * 3, shape=shape)
+        volume = tree_occupancy(tube(length=30, radius=2), where)
+        expected = np.pi * 4 * 30 + 4 / 3 * np.pi * 8
+        assert volume.shape == shape
+        assert volume.sum() * np.prod(where.spacing_mm) == pytest.approx(expected, rel=0.03)
+
+
 def test_joined_branches_are_a_union():
     volume = tree_occupancy(fork(), grid(64))
     assert volume.max() == 1.0
