@@ -233,6 +233,19 @@ def test_path_lengths_with_noise_about_zero_are_taken(case, engine):
     assert found.volume.max() > 0.5
 
 
+@pytest.mark.parametrize("edge", [12, 4, 1])
+def test_voxels_wider_than_any_pixel_do_not_end_the_run(case, edge):
+    """The pictures are not averaged to pixels of that size, which no geometry may have."""
+    angiograms, grid, _ = case
+    wanted = dataclasses.replace(grid, shape=(edge,) * 3)
+    found = Engine().reconstruct(angiograms, wanted)
+    fine = Engine().reconstruct(angiograms, grid)
+    assert found.volume.shape == (edge,) * 3
+    assert found.tree.length_mm == pytest.approx(fine.tree.length_mm, rel=0.05)
+    blood_mm3 = found.volume.sum() * np.prod(wanted.spacing_mm)
+    assert blood_mm3 == pytest.approx(fine.volume.sum() * np.prod(grid.spacing_mm), rel=0.1)
+
+
 def test_wrong_calls(case, engine, tmp_path):
     angiograms, grid, scene = case
     with pytest.raises(UsageError, match="two or more"):

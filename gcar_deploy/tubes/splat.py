@@ -31,9 +31,14 @@ class CellView:
     path_mm: Image
 
 
+def shrink_factor(carm: CArm, pixel_mm: float) -> int:
+    """Pixels along an edge that make one of about ``pixel_mm`` at the isocentre."""
+    return max(round(pixel_mm / carm.pixel_at_isocenter_mm), 1)
+
+
 def shrunk(carm: CArm, picture: Image, pixel_mm: float) -> tuple[CArm, Image]:
     """Area-average a picture so that its pixel at the isocentre is about ``pixel_mm``."""
-    factor = max(round(pixel_mm / carm.pixel_at_isocenter_mm), 1)
+    factor = shrink_factor(carm, pixel_mm)
     if factor == 1:
         return carm, picture
     carm, (small,) = coarsened(carm, (picture,), factor)

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
 from gcar_deploy.gaussians.centers import CenterPoints
-from gcar_deploy.geometry.carm import separation_deg
+from gcar_deploy.geometry.carm import HARD_RANGES, separation_deg
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.centerline import usable_points
@@ -30,7 +30,7 @@ from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.model import footprint, tubes_of
 from gcar_deploy.tubes.settle import scatter_is_none
-from gcar_deploy.tubes.splat import cell_view, shrunk
+from gcar_deploy.tubes.splat import cell_view, shrink_factor, shrunk
 from gcar_deploy.types import Array, Points, Scalars, Volume
 
 #: standard deviation of a voxel half inside a tube, and of one far from its surface
@@ -52,6 +52,8 @@ BAND_BLUR = 0.6
 REACH = 2
 #: the projector needs voxels about as wide as they are deep.
 MAX_ANISOTROPY = 1.01
+#: pixels about as large as the voxels are no picture where no C-arm could have them, mm
+MAX_PIXEL_MM = HARD_RANGES["pixel_spacing_mm"][1]
 #: points stand for voxels where their spacing is the voxel's to this factor.
 SAME_SPACING = 1.2
 #: error at their surface of round tubes fitted to two views, which the points' own noise comes on
@@ -122,6 +124,9 @@ def tube_volume(
     volume = tree_occupancy(tree, grid)
     spacing = grid.spacing_mm
     if not tree.branches or spacing.max() / spacing.min() > MAX_ANISOTROPY:
+        return volume
+    h = float(spacing.mean())
+    if any(shrink_factor(v.carm, h) * max(v.carm.pixel_spacing_mm) > MAX_PIXEL_MM for v in views):
         return volume
     near = _box_round(volume)
     if near is None:
