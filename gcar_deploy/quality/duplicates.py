@@ -47,7 +47,9 @@ def check_duplicates(angiograms: Sequence[Angiogram]) -> None:
 
 def _signature(pixels: Image, side: int) -> Image:
     """(side, side) area averages of mean 0 and length 1; zeros for a constant picture."""
-    small = cv2.resize(np.asarray(pixels, np.float32), (side, side), interpolation=cv2.INTER_AREA)
+    # Sums of the largest grey values would be infinite.
+    scaled = np.asarray(pixels, np.float32) / (np.abs(pixels).max() or 1)
+    small = cv2.resize(scaled, (side, side), interpolation=cv2.INTER_AREA)
     # A background that both views share is no sign of one picture.
     small = small - cv2.GaussianBlur(small, (0, 0), _BACKGROUND_PX)
     small = small - small.mean()

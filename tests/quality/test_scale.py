@@ -133,7 +133,7 @@ def test_a_vessel_along_the_ray_and_a_short_one_tell_nothing():
     assert scale_factor(Tree(nodes_mm=np.zeros((0, 3)), branches=()), picture(along)) is None
 
 
-@pytest.mark.parametrize("change", ["bytes", "depth", "noise", "half", "grey scale"])
+@pytest.mark.parametrize("change", ["bytes", "depth", "noise", "half", "grey scale", "huge"])
 def test_one_picture_given_twice_is_refused_in_any_bytes(change):
     (first, second), *_ = tiny_case()
     pixels = first.pixels
@@ -146,6 +146,8 @@ def test_one_picture_given_twice_is_refused_in_any_bytes(change):
         pixels = cv2.resize(pixels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     if change == "grey scale":
         pixels = 1000 * pixels
+    if change == "huge":
+        pixels = pixels * (3e38 / pixels.max())
     carm = dataclasses.replace(second.carm, rows=pixels.shape[0], columns=pixels.shape[1])
     copy = dataclasses.replace(second, pixels=pixels, carm=carm, sha256="other")
     with pytest.raises(RefusedError, match="same picture"):
