@@ -11,7 +11,14 @@ from pathlib import Path
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, gathered, talk_options
+from gcar_deploy.cli.common import (
+    EngineChoice,
+    Talk,
+    engine_options,
+    gathered,
+    say_result,
+    talk_options,
+)
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, order_options
 from gcar_deploy.inputs.order import Order
 
@@ -94,11 +101,12 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
             on_case=lambda done, *_: bar.update(done - bar.pos),
         )
     if talk.as_json:
-        click.echo(json.dumps({"out": str(order.out), "cases": rows}, allow_nan=False))
+        text = json.dumps({"out": str(order.out), "cases": rows}, allow_nan=False)
+        say_result(text, order.out)
         return
     counts = Counter(row["status"] for row in rows)
     said = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
-    click.echo(f"{order.out}\n{len(rows)} cases: {said}\n{order.out / 'summary.html'}")
+    say_result(f"{order.out}\n{len(rows)} cases: {said}\n{order.out / 'summary.html'}", order.out)
 
 
 def _cores() -> int:

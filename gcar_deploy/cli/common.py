@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from gcar_deploy.engine import Engine
     from gcar_deploy.inputs.order import Order
 
@@ -127,6 +129,27 @@ class EngineChoice:
 
         options = order.options(RunOptions())
         return Engine(self.model, threads=self.threads, options=options)
+
+
+def say_result(text: str, folder: Path) -> None:
+    """Print what a result is.
+
+    Raises
+    ------
+    GcarError
+        Nobody could read it; the result stays, and the error tells where.
+    """
+    from gcar_deploy.errors import GcarError
+
+    try:
+        click.echo(text)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        reason = error.strerror or error
+        raise GcarError(
+            f"standard output cannot be written ({reason}); the result lies in {folder}"
+        ) from None
 
 
 def talk_options(*wanted: str) -> Callable[[_Function], Any]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, talk_options
+from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, say_result, talk_options
 from gcar_deploy.cli.request import METHOD, order_options
 from gcar_deploy.inputs.order import Order
 
@@ -68,9 +68,10 @@ def demo(order: Order, engine: EngineChoice, talk: Talk) -> None:
     if talk.as_json:
         found = {name: measure.value for name, measure in measures.items()}
         out = {"out": str(folder), "measures": found, "wall_s": whole, **result.summary()}
-        click.echo(json.dumps(out, allow_nan=False))
+        text = json.dumps(out, allow_nan=False)
     else:
-        click.echo("\n".join(lines(result, measures, folder, whole)))
+        text = "\n".join(lines(result, measures, folder, whole))
+    say_result(text, folder)
 
 
 def _holds_a_demo(folder: Path, pictures: Sequence[Path]) -> bool:

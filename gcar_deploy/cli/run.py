@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, talk_options
+from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, say_result, talk_options
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, READING, order_options
 from gcar_deploy.inputs.order import Order, check_views, order_to_json
 
@@ -62,9 +62,10 @@ def run(
         talk.note(result.notes)
         folder = deliver(result, order)
     if talk.as_json:
-        click.echo(json.dumps({"out": str(folder), **result.summary()}, allow_nan=False))
+        text = json.dumps({"out": str(folder), **result.summary()}, allow_nan=False)
     else:
-        click.echo("\n".join(summary_lines(result, folder)))
+        text = "\n".join(summary_lines(result, folder))
+    say_result(text, folder)
 
 
 def _step_folder(folder: Path, out: Path) -> OnStep:

@@ -20,11 +20,18 @@ def in_shell(redirected, folder, *words):
     )  # fmt: skip
 
 
-def run_of(case, out, *extra):
-    return (
-        "run", case / "view1.png", case / "view2.png", "--geom", case / "geom.json",
-        "--out", out, "--predictor", "none", *extra,
-    )  # fmt: skip
+def words_of(verb, case, folder):
+    """A short call of a verb that writes into ``folder``, if anywhere."""
+    geometry, *views = (case / name for name in ("geom.json", "view1.png", "view2.png"))
+    to = ("--out", folder / "out", "--predictor", "none")
+    table = folder / "cases.csv"
+    table.write_text(f"case,geom,view1,view2\na,{geometry},{views[0]},{views[1]}\n")
+    return {
+        "run": ("run", *views, "--geom", geometry, *to),
+        "demo": ("demo", *to),
+        "batch": ("batch", table, *to, "--jobs", "2"),
+        "bench": ("bench", "--stages", "--repeats", "1"),
+    }[verb]
 
 
 @pytest.mark.parametrize(
@@ -32,15 +39,16 @@ def run_of(case, out, *extra):
 )
 def test_a_closed_standard_error_is_none(verb, good_case, tmp_path):
     """Its number is free then, and the next file that is opened would get it."""
-    table, out = tmp_path / "cases.csv", tmp_path / "out"
-    files = ",".join(str(good_case / name) for name in ("geom.json", "view1.png", "view2.png"))
-    table.write_text(f"case,geom,view1,view2\na,{files}\n")
-    words = {
-        "run": run_of(good_case, out),
-        "demo": ("demo", "--out", out, "--predictor", "none"),
-        "batch": ("batch", table, "--out", out, "--jobs", "2", "--predictor", "none"),
-        "bench": ("bench", "--stages", "--repeats", "1"),
-    }[verb]
-    done = in_shell("2>&-", tmp_path, *words)
+    done = in_shell("2>&-", tmp_path, *words_of(verb, good_case, tmp_path))
     assert done.returncode == 0 and done.stdout != ""
-    assert verb == "bench" or out.is_dir()
+    assert verb == "bench" or (tmp_path / "out").is_dir()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("verb", ["demo", "batch"])
+def test_a_result_whose_summary_nobody_can_read_stays_and_is_named(verb, good_case, tmp_path):
+    """As of ``run``, beside the other faults of that verb."""
+    done = in_shell(">/dev/full", tmp_path, *words_of(verb, good_case, tmp_path))
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(f"; the result lies in {tmp_path / 'out'}")
+    assert (tmp_path / "out").is_dir()

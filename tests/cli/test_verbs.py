@@ -315,7 +315,10 @@ def test_a_full_disk_behind_stdout_is_one_line_and_the_result_stays(good_case, t
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == "gcar: error: cannot write: No space left on device"
+    assert done.stderr.splitlines()[-1] == (
+        "gcar: error: standard output cannot be written (No space left on device); "
+        f"the result lies in {tmp_path / 'out'}"
+    )
     assert (tmp_path / "out" / "result.json").is_file()
 
 
