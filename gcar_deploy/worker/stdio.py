@@ -2,7 +2,8 @@
 
 Methods: ``reconstruct`` (params as ``orders.receive``; answered when finished),
 ``cancel`` ({"id": id of the request}), ``health``, ``shutdown``. Notifications: ``progress``
-({"id", "stage", "share"}). Error codes above 0 are the exit codes of ``gcar run``.
+({"id", "stage", "share"}). Error codes above 0 are the exit codes of ``gcar run``. What comes
+without an id is a notification, never answered: ``cancel`` and ``shutdown`` are done, others not.
 """
 
 from __future__ import annotations
@@ -67,16 +68,19 @@ class LineServer:
         except GeometryError as error:
             self._fail(None, PARSE_ERROR, f"not JSON ({error})")
             return True
-        ident = message.get("id") if isinstance(message, dict) else None
         if not (
             isinstance(message, dict)
             and message.get("jsonrpc") == "2.0"
             and isinstance(message.get("method"), str)
-            and isinstance(ident, (str, int))
+            and _is_id(message.get("id", ""))
         ):
-            self._fail(None, INVALID_REQUEST, "not a JSON-RPC 2.0 request with an id")
+            text = "not one JSON-RPC 2.0 request whose id is a string or a whole number"
+            self._fail(None, INVALID_REQUEST, text)
             return True
         method, params = message["method"], message.get("params", {})
+        if "id" not in message:
+            return self._notified(method, params)
+        ident = message["id"]
         try:
             if method == "reconstruct":
                 self._reconstruct(ident, params)
@@ -99,6 +103,12 @@ class LineServer:
             self._fail(ident, error.exit_code, str(error))
         return True
 
+    def _notified(self, method: str, params: Any) -> bool:
+        """Do what wants no answer; False ends the service."""
+        if method == "cancel":
+            self._cancel(params)
+        return method != "shutdown"
+
     def _reconstruct(self, ident: Any, params: Any) -> None:
         received = receive(params, self._folder)
         if received.order.out is None:
@@ -112,6 +122,8 @@ class LineServer:
 
     def _cancel(self, params: Any) -> bool:
         wanted = params.get("id") if isinstance(params, dict) else None
+        if not _is_id(wanted):
+            return False
         with self._asking:
             found = [job for job, ident in self._request_of.items() if ident == wanted]
         job = self._queue.get(found[0]) if found else None
@@ -153,3 +165,8 @@ class LineServer:
             except (BrokenPipeError, ValueError):
                 # The host is gone; the end of the input tells the rest.
                 return
+
+
+def _is_id(value: Any) -> bool:
+    """Whether a value may name a request; to Python, true is a number."""
+    return isinstance(value, (str, int)) and not isinstance(value, bool)

@@ -28,6 +28,9 @@ class Pipe:
     def flush(self):
         pass
 
+    def empty(self):
+        return self._lines.empty()
+
     def close(self):
         self._lines.put("")
 
@@ -46,6 +49,9 @@ class Host:
     def send(self, ident, method, **params):
         message = {"jsonrpc": "2.0", "id": ident, "method": method, "params": params}
         self.to.write(json.dumps(message) + "\n")
+
+    def notify(self, method, **params):
+        self.to.write(json.dumps({"jsonrpc": "2.0", "method": method, "params": params}) + "\n")
 
     def answer(self, ident):
         while True:
@@ -101,7 +107,12 @@ def test_cancel_and_health(make_queue, case_folder, tmp_path, gate):
         ("{", -32700),
         ("[]", -32600),
         ('{"id": 1, "method": "health"}', -32600),
-        ('{"jsonrpc": "2.0", "method": "health"}', -32600),
+        ('{"method": "health"}', -32600),
+        ('{"jsonrpc": "2.0", "method": 1}', -32600),
+        ('{"jsonrpc": "2.0", "id": null, "method": "health"}', -32600),
+        ('{"jsonrpc": "2.0", "id": true, "method": "health"}', -32600),
+        ('{"jsonrpc": "2.0", "id": 1.5, "method": "health"}', -32600),
+        ('[{"jsonrpc": "2.0", "id": 1, "method": "health"}]', -32600),
         ('{"jsonrpc": "2.0", "id": 1, "method": "dance"}', -32601),
         ('{"jsonrpc": "2.0", "id": 1, "method": "reconstruct", "params": {}}', -32602),
         ('{"jsonrpc": "2.0", "id": 1, "method": "reconstruct", "params": [1]}', -32602),
@@ -110,8 +121,31 @@ def test_cancel_and_health(make_queue, case_folder, tmp_path, gate):
 def test_messages_that_are_not_understood(make_queue, line, code):
     host = Host(make_queue)
     host.to.write(line + "\n")
-    assert json.loads(host.back.readline())["error"]["code"] == code
+    answer = json.loads(host.back.readline())
+    assert answer["error"]["code"] == code
+    assert answer["id"] == (None if code in (-32700, -32600) else 1)
     host.end()
+
+
+def test_notifications_are_never_answered(make_queue, case_folder, tmp_path, gate):
+    gate.clear()
+    host = Host(make_queue)
+    host.send(1, "reconstruct", **order(case_folder, tmp_path / "out"))
+    for method in ("health", "dance", "reconstruct"):
+        host.notify(method)
+    host.notify("reconstruct", **order(case_folder, tmp_path / "other"))
+    host.send(2, "health")
+    assert sum(host.answer(2)["result"]["jobs"].values()) == 1
+    # To Python, true is 1.
+    host.send(3, "cancel", id=True)
+    assert host.answer(3)["result"] == {"cancelled": False}
+    host.notify("cancel", id=1)
+    assert host.answer(1)["error"]["code"] == 7
+    host.notify("shutdown")
+    host.thread.join(60)
+    assert not host.thread.is_alive()
+    answered = [message["id"] for message in host.seen if "method" not in message]
+    assert answered == [2, 3, 1] and host.back.empty()
 
 
 @pytest.mark.req("REQ-41")
