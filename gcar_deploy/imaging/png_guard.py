@@ -21,6 +21,8 @@ _CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
 #: TIFF sample formats, and what is read of them
 _UNSIGNED, _FLOATING = 1, 3
 _TIFF_KINDS = "8 or 16 bit grey, or 32 bit floating-point grey, is needed"
+#: JPEG as a TIFF compression, old and new
+_JPEG = (6, 7)
 _MAX_TIFF_ENTRIES = 256
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 
@@ -127,8 +129,8 @@ def check_tiff(data: bytes, smallest: int, largest: int) -> int:
     Raises
     ------
     ValueError
-        Truncated, several pages, turned by an orientation tag, neither 8 or 16 bit unsigned nor
-        32 bit floating-point grey, a palette or inverted grey, sides out of range.
+        Truncated, several pages, JPEG, turned by an orientation tag, neither 8 or 16 bit unsigned
+        nor 32 bit floating-point grey, a palette or inverted grey, sides out of range.
     """
     order = "<" if data[:2] == b"II" else ">"
     tags, next_page = _tiff_directory(data, order, _first_page(data, order))
@@ -183,6 +185,10 @@ def _check_tiff_page(
     """Return bit depth and (rows, columns) of one page."""
     rows, columns = _one(tags, 257, 0), _one(tags, 256, 0)
     check_sides(rows, columns, smallest, largest)
+    if _one(tags, 259, 1) in _JPEG:
+        raise ValueError(
+            "holds a JPEG picture: its compression loses thin vessels; export it without, or as PNG"
+        )
     depths, formats = set(tags.get(258, (1,))), set(tags.get(339, (_UNSIGNED,)))
     if len(depths) != 1 or not depths <= {8, 16, 32}:
         raise ValueError(f"has {sorted(depths)} bits per sample; {_TIFF_KINDS}")

@@ -92,8 +92,8 @@ def test_interlaced(tmp_path, size):
     np.testing.assert_array_equal(read_picture(tmp_path / "p.png")[0], truth)
 
 
-def _encoded(suffix, picture):
-    return cv2.imencode(suffix, picture)[1].tobytes()
+def _encoded(suffix, picture, *how):
+    return cv2.imencode(suffix, picture, how)[1].tobytes()
 
 
 def _npy(array, **kwargs):
@@ -148,6 +148,8 @@ _BAD = {
     "pages.tif": (_tiff(next_page=8), "several pages"),
     "turned.tif": (_tiff(t274=6), "orientation"),
     "inverted.tif": (_tiff(t262=0), "plain grey"),
+    "jpeg.tif": (_encoded(".tiff", _GREY, cv2.IMWRITE_TIFF_COMPRESSION, 7), "holds a JPEG"),
+    "old_jpeg.tif": (_tiff(t259=6), "loses thin vessels"),
     "deep.tif": (_tiff(t258=64), "bits per sample"),
     "long.tif": (_tiff(t258=32), "signed samples"),
     "float.tif": (_tiff(t339=3), "floating-point"),
