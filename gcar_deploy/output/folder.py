@@ -56,7 +56,7 @@ def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -
     if out_dir.exists():
         _check_existing(out_dir, inputs)
         if not force:
-            raise UsageError(f"{out_dir} exists; choose another folder or add --force")
+            raise _taken(out_dir)
     ancestor = out_dir.absolute().parent
     while not ancestor.exists() and not ancestor.is_symlink():
         ancestor = ancestor.parent
@@ -64,6 +64,10 @@ def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -
         raise UsageError(f"{out_dir} cannot be made: {ancestor} is not a folder")
     if not os.access(ancestor, os.W_OK | os.X_OK):
         raise UsageError(f"{out_dir} cannot be made: {ancestor} is not writable")
+
+
+def _taken(out_dir: Path) -> UsageError:
+    return UsageError(f"{out_dir} exists; choose another folder or add --force")
 
 
 def _check_existing(out_dir: Path, inputs: tuple[Path, ...]) -> None:
@@ -196,11 +200,17 @@ def _sync_folder(path: Path) -> None:
 
 def _put(fresh: Path, out_dir: Path, old: Path, *, force: bool) -> None:
     if not out_dir.exists():
-        if not _rename2(fresh, out_dir, _RENAME_NOREPLACE):
-            os.rename(fresh, out_dir)
-        return
+        try:
+            if not _rename2(fresh, out_dir, _RENAME_NOREPLACE):
+                os.rename(fresh, out_dir)
+            return
+        except OSError as error:
+            # Another run may have been faster.
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                raise
+    _check_existing(out_dir, ())
     if not force:
-        raise FileExistsError(errno.EEXIST, "it exists by now", str(out_dir))
+        raise _taken(out_dir)
     if _rename2(fresh, out_dir, _RENAME_EXCHANGE):
         return
     os.rename(out_dir, old)

@@ -211,6 +211,35 @@ def test_a_folder_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
     assert listing(tmp_path) == {"out/theirs": b"1"}
 
 
+@pytest.mark.parametrize("where", ["_sync_folder", "_rename2", "os.rename"])
+@pytest.mark.parametrize("force", [False, True])
+def test_the_slower_of_two_runs_is_told_as_if_it_had_come_later(
+    tmp_path, monkeypatch, where, force
+):
+    """The faster one is done before the folder is put in place, or just when it is."""
+    out, theirs = tmp_path / "out", {"theirs": b"1"}
+    place = folder.os if where == "os.rename" else folder
+    name = where.removeprefix("os.")
+    real = getattr(place, name)
+
+    def late(*arguments):
+        monkeypatch.undo()
+        write_folder(out, theirs)
+        return real(*arguments)
+
+    if where == "os.rename":
+        monkeypatch.setattr(folder, "_rename2", lambda *_: False)
+    monkeypatch.setattr(place, name, late)
+    if force:
+        write_folder(out, FILES, force=True)
+    else:
+        with pytest.raises(UsageError, match="out exists; choose another folder or add --force"):
+            write_folder(out, FILES)
+    monkeypatch.undo()
+    assert listing(out) == (FILES if force else theirs)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(
     ("number", "code"),
