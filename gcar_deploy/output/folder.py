@@ -67,7 +67,8 @@ def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -
 
 
 def _taken(out_dir: Path) -> UsageError:
-    return UsageError(f"{out_dir} exists; choose another folder or add --force")
+    what = "choose another folder or add --force (in an order force)"
+    return UsageError(f"{out_dir} exists; {what}")
 
 
 def _check_existing(out_dir: Path, inputs: tuple[Path, ...]) -> None:

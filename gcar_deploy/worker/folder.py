@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import stat
 from collections.abc import Iterator
@@ -95,6 +96,14 @@ class AllowedFolder:
             if path.is_symlink():
                 raise UsageError(f"path {name!r}: {part} is a link; links are not followed")
         return path
+
+    def inside(self, text: str) -> str:
+        """Name paths in a text as orders do, without what leads to the folder."""
+        if self.root == self.root.parent:
+            return text
+        # Where a word begins: a folder of the same name may lie further inside.
+        root = r"(?<!\S)" + re.escape(str(self.root))
+        return re.sub(root + r"(?!\S)", "the folder", re.sub(root + re.escape(os.sep), "", text))
 
     @contextlib.contextmanager
     def _opened(self, parts: tuple[str, ...]) -> Iterator[int]:

@@ -200,7 +200,7 @@ def _uploaded(folder: AllowedFolder | None) -> Received:
         return scratch / path
 
     try:
-        return Received(order.with_files(saved), scratch)
+        return Received(order.with_files(saved), scratch, folder)
     except BaseException:
         drop_scratch(scratch)
         raise

@@ -190,10 +190,10 @@ class JobQueue:
             job.summary, job.folder = self._work(job.order, on_progress, job.wish_to_stop.is_set)
             state = DONE
         except CancelledError as error:
-            job.error, job.exit_code = str(error), error.exit_code
+            job.error, job.exit_code = job.received.said(error), error.exit_code
             state = CANCELLED if job.wish_to_stop.is_set() else FAILED
         except GcarError as error:
-            job.error, job.exit_code = str(error), error.exit_code
+            job.error, job.exit_code = job.received.said(error), error.exit_code
             state = REFUSED if isinstance(error, RefusedError) else FAILED
         except Exception as error:  # noqa: BLE001 - one broken job must not end the worker
             if out_of_memory(error):

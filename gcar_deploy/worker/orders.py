@@ -18,16 +18,28 @@ _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,8}")
 
 @dataclasses.dataclass(frozen=True)
 class Received:
-    """An order whose files are at hand, and the private folder that goes with it (or None)."""
+    """An order whose files are at hand.
+
+    Attributes
+    ----------
+    order : Order
+    scratch : the private folder that goes with it, or None
+    folder : the one that its paths lie in, or None
+    """
 
     order: Order
     scratch: Path | None = None
+    folder: AllowedFolder | None = None
 
     @property
     def private(self) -> bool:
         """Whether the result is to stay in the private folder."""
         out = self.order.out
         return self.scratch is not None and out is not None and self.scratch in out.parents
+
+    def said(self, error: Exception) -> str:
+        """Return the text of an error; its paths are those that the order gave."""
+        return str(error) if self.folder is None else self.folder.inside(str(error))
 
     def clean(self) -> None:
         """Remove the private folder."""
@@ -60,7 +72,7 @@ def receive(values: Any, folder: AllowedFolder | None) -> Received:
     except BaseException:
         drop_scratch(scratch)
         raise
-    return Received(own, scratch)
+    return Received(own, scratch, folder)
 
 
 def placed(order: Order, folder: AllowedFolder) -> Order:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gcar_deploy.worker.folder import AllowedFolder
 from tests.worker.conftest import TOKEN, Client, multipart
 
 ORDER = {"views": ["view1.png", "view2.png"], "geometry": "geom.json"}
@@ -45,7 +46,19 @@ def test_files_of_the_folder_become_a_result_folder(serving):
     assert stored == job["result"]
     again = ask("POST", "/v1/reconstruct?wait=60", {**ORDER, "out": "results/a"}).json()
     assert again["state"] == "failed" and again["error"]["exit_code"] == 2
-    assert "exists" in again["error"]["message"]
+    assert again["error"]["message"].startswith("results/a exists; ")
+    assert "in an order force" in again["error"]["message"]
+    (folder / "file").write_bytes(b"1")
+    barred = ask("POST", "/v1/reconstruct?wait=60", {**ORDER, "out": "file/a"}).json()
+    assert barred["error"]["message"] == "file/a cannot be made: file is not a folder"
+
+
+def test_texts_name_paths_as_orders_do(tmp_path):
+    folder = AllowedFolder(tmp_path)
+    assert folder.inside(f"{tmp_path}/a{tmp_path}/b exists") == f"a{tmp_path}/b exists"
+    assert folder.inside(f"x: {tmp_path} is not writable") == "x: the folder is not writable"
+    assert folder.inside(f"{tmp_path}2/a exists") == f"{tmp_path}2/a exists"
+    assert AllowedFolder(Path("/")).inside("2 / 3 of /a") == "2 / 3 of /a"
 
 
 def test_uploads_are_fetched_and_forgotten(serving):
