@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.matrix import applied, axes, checked, read_off
 from gcar_deploy.types import Array, Pixels, Points, Scalars
 
 #: key -> (lowest, highest, unit) of what is accepted at all.
@@ -43,6 +44,8 @@ CLINICAL_RANGES: dict[str, tuple[float, float, str]] = {
 }
 #: a 3x4 matrix given beside the angles must agree with them to this many pixels.
 MATRIX_TOLERANCE_PX = 0.5
+#: where the detector stands if only a matrix is given, which does not tell it
+SDD_OVER_SOD = 1.5
 
 
 def _check_range(key: str, value: float, unit_suffix: str = "") -> None:
@@ -141,18 +144,10 @@ class CArm:
             self._check_matrix()
 
     def _check_matrix(self) -> None:
-        try:
-            P = np.asarray(self.projection_matrix, dtype=np.float64)
-        except (TypeError, ValueError):
-            P = np.empty(0)
-        if P.shape != (3, 4) or not np.isfinite(P).all():
-            raise GeometryError("projection_matrix must be 3 rows of 4 finite numbers")
-        if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.prod(np.linalg.norm(P[:, :3], axis=1)):
-            raise GeometryError("projection_matrix is singular: its left 3x3 block has no inverse")
-        P = _normalised(P)
+        P = checked(self.projection_matrix)
         object.__setattr__(self, "projection_matrix", tuple(map(tuple, P.tolist())))
         probe = 30.0 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        own, given = _apply(self._matrix_from_angles(), probe)[0], _apply(P, probe)[0]
+        own, given = applied(self._matrix_from_angles(), probe)[0], applied(P, probe)[0]
         gap = float(np.abs(own - given).max())
         if gap > MATRIX_TOLERANCE_PX:
             raise GeometryError(
@@ -166,54 +161,29 @@ class CArm:
 
         The angles, distances and in-plane rotation are read off the matrix by an RQ
         decomposition; the pixel spacing at the detector, which a matrix does not carry, is
-        set so that SDD = 1.5 SOD. Skewed pixels are refused.
+        set so that SDD = ``SDD_OVER_SOD`` SOD. Skewed pixels are refused.
         """
-        P = np.asarray(matrix, dtype=np.float64)
-        if P.shape != (3, 4) or not np.isfinite(P).all():
-            raise GeometryError("projection_matrix must be 3 rows of 4 finite numbers")
-        if abs(np.linalg.det(P[:, :3])) <= 1e-12 * np.prod(np.linalg.norm(P[:, :3], axis=1)):
-            raise GeometryError("projection_matrix is singular: its left 3x3 block has no inverse")
-        P = _normalised(P)
-        d = P[2, :3]
-        c0, r0 = float(P[0, :3] @ d), float(P[1, :3] @ d)
-        u_scaled, v_scaled = P[0, :3] - c0 * d, P[1, :3] - r0 * d
-        f_col, f_row = float(np.linalg.norm(u_scaled)), float(np.linalg.norm(v_scaled))
-        u, v = u_scaled / f_col, v_scaled / f_row
-        if abs(u @ v) > 1e-6:
-            raise GeometryError("projection_matrix has skewed pixels, which are not supported")
-        if np.linalg.det(np.stack([u, v, d])) > 0:
-            raise GeometryError(
-                "projection_matrix is a mirror image: pictures must be shown from the detector "
-                "towards the source (det R = -1)"
-            )
-        secondary = math.degrees(math.asin(float(np.clip(d[2], -1, 1))))
-        primary = math.degrees(math.atan2(d[0], -d[1])) if abs(d[2]) < 1 - 1e-12 else 0.0
-        u0, v0, _ = _axes(primary, secondary, 0.0)
-        rotation = math.degrees(math.atan2(-float(u @ v0), float(u @ u0)))
-        # t = (u.o, v.o, SOD + d.o): only the depth is a distance, the rest is an offset.
-        t = np.array([P[0, 3] - c0 * P[2, 3], P[1, 3] - r0 * P[2, 3], P[2, 3]])
-        offset = u * t[0] / f_col + v * t[1] / f_row
-        sod = float(P[2, 3])
+        P = checked(matrix)
+        told = read_off(P)
+        sdd = SDD_OVER_SOD * told.sod_mm
         return cls(
-            primary_angle_deg=primary,
-            secondary_angle_deg=secondary,
-            detector_rotation_deg=rotation,
-            sod_mm=sod,
-            sdd_mm=1.5 * sod,
+            primary_angle_deg=told.primary_deg,
+            secondary_angle_deg=told.secondary_deg,
+            detector_rotation_deg=told.rotation_deg,
+            sod_mm=told.sod_mm,
+            sdd_mm=sdd,
             rows=rows,
             columns=columns,
-            pixel_spacing_mm=(1.5 * sod / f_row, 1.5 * sod / f_col),
-            principal_point_px=(c0, r0),
-            isocenter_offset_mm=tuple(offset.tolist()),
+            pixel_spacing_mm=(sdd / told.focal_px[1], sdd / told.focal_px[0]),
+            principal_point_px=told.principal_point_px,
+            isocenter_offset_mm=told.offset_mm,
             projection_matrix=tuple(map(tuple, P.tolist())),
         )
 
     # -- matrices -------------------------------------------------------------------------
 
     def _matrix_from_angles(self) -> Array:
-        u, v, d = _axes(
-            self.primary_angle_deg, self.secondary_angle_deg, self.detector_rotation_deg
-        )
+        u, v, d = axes(self.primary_angle_deg, self.secondary_angle_deg, self.detector_rotation_deg)
         R = np.stack([u, v, d])
         t = np.array([0.0, 0.0, self.sod_mm]) + R @ np.asarray(self.isocenter_offset_mm)
         c0, r0 = self.principal_point
@@ -291,7 +261,7 @@ class CArm:
             Distance from the source along the central ray; not positive behind the source,
             where the pixels mean nothing.
         """
-        return _apply(self.world2pixel, np.asarray(points_mm, dtype=np.float64))
+        return applied(self.world2pixel, np.asarray(points_mm, dtype=np.float64))
 
     def jacobian(self, points_mm: Points) -> Array:
         """(n, 2, 3) derivative of (col, row) by the point, pixels per mm."""
@@ -393,28 +363,3 @@ def separation_deg(first: CArm, second: CArm) -> float:
     """Angle between the central rays of two views, degrees, 0 .. 180."""
     cosine = float(np.clip(first.axes[2] @ second.axes[2], -1.0, 1.0))
     return math.degrees(math.acos(cosine))
-
-
-def _axes(primary_deg: float, secondary_deg: float, rotation_deg: float) -> tuple[Array, ...]:
-    a, b, g = (math.radians(x) for x in (primary_deg, secondary_deg, rotation_deg))
-    u = np.array([math.cos(a), math.sin(a), 0.0])
-    v = np.array([math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b), -math.cos(b)])
-    d = np.array([math.sin(a) * math.cos(b), -math.cos(a) * math.cos(b), math.sin(b)])
-    cg, sg = math.cos(g), math.sin(g)
-    # Rows run downwards, so counter-clockwise in the picture is u -> u cos g - v sin g.
-    return u * cg - v * sg, u * sg + v * cg, d
-
-
-def _normalised(P: Array) -> Array:
-    """Scale P so that its third row measures depth in mm, positive at the isocentre."""
-    P = P / np.linalg.norm(P[2, :3])
-    return P if P[2, 3] > 0 else -P
-
-
-def _apply(P: Array, points: Points) -> tuple[Pixels, Scalars]:
-    # Coordinates as rows: several times faster than three columns, and equal to the last bit.
-    homogeneous = P[:, :3] @ points.T + P[:, 3:]
-    pixels = np.empty((len(points), 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(homogeneous[:2], homogeneous[2], out=pixels.T)
-    return pixels, homogeneous[2]

@@ -12,8 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.carm import HARD_RANGES, SDD_OVER_SOD, CArm
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.matrix import read_off
 from gcar_deploy.types import Points
 
 #: geometry nearer than this is the same geometry: mm, pixels, degrees; far below what any gantry
@@ -41,18 +43,34 @@ class OwnFrame:
         return self.order.index(view)
 
     def carm(self, carm: CArm) -> CArm:
-        """Return a view in the scene's own coordinates, its numbers to ``GRAIN_DIGITS``."""
+        """Return a view in the scene's own coordinates, its numbers to ``GRAIN_DIGITS``.
+
+        All are read off its matrix, so that it is the same whether it was given by angles and
+        distances, by a matrix, or by both.
+        """
         own = carm.moved(self.origin_mm)
-        if own.projection_matrix is not None:
+        try:
+            told = read_off(own.world2pixel)
+        except GeometryError:
+            # Beside angles a matrix may be a little skewed, which they do not say.
             return own
-        point = own.principal_point_px
-        x, y, z = (_even(value) for value in own.isocenter_offset_mm)
-        return dataclasses.replace(
-            own,
-            primary_angle_deg=_even(own.primary_angle_deg),
-            secondary_angle_deg=_even(own.secondary_angle_deg),
-            detector_rotation_deg=_even(own.detector_rotation_deg),
-            principal_point_px=None if point is None else (_even(point[0]), _even(point[1])),
+        sod, (f_col, f_row) = _even(told.sod_mm), map(_even, told.focal_px)
+        # Nothing but the size of things at the isocentre is told, unless it is out of all ranges.
+        low, high, _ = HARD_RANGES["pixel_spacing_mm"]
+        usual = low * max(f_col, f_row) <= SDD_OVER_SOD * sod <= high * min(f_col, f_row)
+        sdd = (SDD_OVER_SOD if usual else own.magnification) * sod
+        column, row = map(_even, told.principal_point_px)
+        x, y, z = map(_even, told.offset_mm)
+        return CArm(
+            primary_angle_deg=_even(told.primary_deg),
+            secondary_angle_deg=_even(told.secondary_deg),
+            detector_rotation_deg=_even(told.rotation_deg),
+            sod_mm=sod,
+            sdd_mm=sdd,
+            rows=own.rows,
+            columns=own.columns,
+            pixel_spacing_mm=(sdd / f_row, sdd / f_col),
+            principal_point_px=(column, row),
             isocenter_offset_mm=(x, y, z),
         )
 

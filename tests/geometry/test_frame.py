@@ -54,3 +54,28 @@ def test_views_of_equal_angles_stand_in_the_order_of_their_pictures() -> None:
     twins = [view(45, 25), view(45.0000001, 25), view(-30, 0)]
     assert own_frame(twins, ["b", "a", "c"]).order == (2, 1, 0)
     assert own_frame(twins[::-1], ["c", "a", "b"]).order == (0, 1, 2)
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0, 1e-7, 1e3])
+@pytest.mark.parametrize("shift", [(0, 0, 0), (13.37, -2.21, 80.3)])
+def test_a_view_told_by_its_matrix_is_the_view_told_by_angles(factor, shift) -> None:
+    views = [carm.moved(shift) for carm in VIEWS]
+    base = own_frame(views, "abc")
+    told = [CArm.from_matrix(factor * c.world2pixel, rows=c.rows, columns=c.columns) for c in views]
+    both = [
+        dataclasses.replace(c, projection_matrix=tuple(map(tuple, (factor * c.world2pixel))))
+        for c in views
+    ]
+    for carms in (told, both):
+        frame = own_frame(carms, "abc")
+        assert [frame.carm(c) for c in carms] == [base.carm(c) for c in views]
+
+
+@pytest.mark.parametrize("pitch", [0.021, 9.9])
+def test_views_of_the_finest_and_the_widest_pixels_have_a_frame(pitch: float) -> None:
+    carms = [dataclasses.replace(carm, pixel_spacing_mm=(pitch, pitch)) for carm in VIEWS[::2]]
+    carms = [dataclasses.replace(carm, sdd_mm=770 if pitch > 1 else 1800) for carm in carms]
+    frame = own_frame(carms, "ab")
+    for carm in carms:
+        own = frame.carm(carm).project(POINTS - frame.origin_mm)
+        np.testing.assert_allclose(own[0], carm.project(POINTS)[0], rtol=1e-6, atol=1e-4)
