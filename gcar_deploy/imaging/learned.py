@@ -20,7 +20,7 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.bands import without_bands
 from gcar_deploy.imaging.catheter import catheters
 from gcar_deploy.imaging.contrast import scaled_contrast
-from gcar_deploy.imaging.device_lines import device_map, device_parts
+from gcar_deploy.imaging.device_lines import device_map, device_parts, is_between
 from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.imaging.net import (
     NOMINAL_MM,
@@ -158,8 +158,11 @@ def devices(told: Image, reach: Mask, line: Mask, picture: Image, holes: Mask) -
     half = exact_distance(reach)
     found = np.zeros_like(reach)
     course = catheters(line, flat, sigma_px, ~holes, pixel_mm)
-    for part in (course, *device_parts(line, told, DEVICE_LEVEL, finer)):
-        if not part.any():
+    parts = [course, *device_parts(line, told, DEVICE_LEVEL, finer)]
+    rest = line & ~np.any(parts, axis=0)
+    for part in parts:
+        # A device that is one between two stretches of vessel is none, or they are.
+        if not part.any() or (part is not course and is_between(part, rest, half, pixel_mm)):
             continue
         even = part & (half <= WIDER * float(np.median(half[part])))
         more = found | skel.beside_alone(reach, line, even)

@@ -10,7 +10,7 @@ import pytest
 
 from gcar_deploy.errors import ImageError
 from gcar_deploy.imaging import skeleton as skel
-from gcar_deploy.imaging.device_lines import device_map, device_parts
+from gcar_deploy.imaging.device_lines import device_map, device_parts, is_between
 from gcar_deploy.imaging.learned import devices
 from gcar_deploy.imaging.net import SIDE, Seen
 from gcar_deploy.imaging.stray_lines import likely_devices, without_line
@@ -153,3 +153,56 @@ def test_a_blob_at_the_tip_of_a_catheter_is_a_vessel_seen_end_on():
     found = devices(told, reach, line, reach.astype(np.float32), nothing)
     assert found[200:205, 5:170].all()
     assert not found[np.hypot(row - 202, col - 200) <= 8].any() and not found[230:].any()
+
+
+def lines(*ways):
+    """One line a way of (col, row) corners, a pixel wide, as (200, 200) bool each."""
+    out = []
+    for way in ways:
+        canvas = np.zeros((200, 200), np.uint8)
+        cv2.polylines(canvas, [np.array(way, np.int32)], isClosed=False, color=1)
+        out.append(canvas > 0)
+    return out
+
+
+STRETCH = [(80, 100), (120, 100)]
+BEFORE, AFTER = [(20, 96), (79, 100)], [(121, 100), (180, 104)]
+
+
+@pytest.mark.parametrize(("rest", "one"), [
+    # What goes on at both ends is one line with it; at one end it may be a wire in a vessel.
+    ([BEFORE, AFTER], True), ([BEFORE], False), ([], False),
+    # Vessels that a lead crosses do not go on from its ends, nor does what turns off.
+    ([[(79, 20), (79, 180)], [(121, 20), (121, 180)]], False),
+    ([BEFORE, [(121, 100), (150, 150)]], False),
+    # Three lines meet in it.
+    ([BEFORE, [(121, 100), (150, 150)], [(100, 95), (100, 20)]], True),
+])  # fmt: skip
+def test_what_vessels_go_on_from_is_no_device(rest, one):
+    (stretch,) = lines(STRETCH)
+    if len(rest) == 3:
+        stretch |= lines([(100, 100), (100, 97)])[0]
+    others = np.any(lines(*rest), axis=0) if rest else np.zeros_like(stretch)
+    half = np.full(stretch.shape, 3, np.float32)
+    assert is_between(stretch, others & ~stretch, half, 0.5) is one
+
+
+@pytest.mark.parametrize(("wider", "one"), [(1.3, True), (2.0, False), (0.5, False)])
+def test_a_device_between_vessels_of_other_width_stays_one(wider, one):
+    (stretch,), rest = lines(STRETCH), np.any(lines(BEFORE, AFTER), axis=0)
+    half = np.where(stretch, 3, np.float32(3 * wider))
+    assert is_between(stretch, rest & ~stretch, half, 0.5) is one
+
+
+def test_a_stretch_of_vessel_that_the_network_takes_for_a_device_stays():
+    picture = np.zeros((352, 352), np.float32)
+    whole = np.zeros((352, 352), np.uint8)
+    cv2.polylines(whole, [np.array([(60, 170), (290, 180)], np.int32)], False, 1)
+    line, reach = whole > 0, cv2.dilate(whole, np.ones((7, 7), np.uint8)) > 0
+    cv2.polylines(picture, [np.array([(60, 170), (290, 180)], np.int32)], False, 1.0, 7)
+    told = np.zeros((352, 352), np.float32)
+    holes = np.zeros_like(line)
+    told[:, 150:200] = 0.99
+    assert not devices(told, reach, line, picture, holes)[:, 155:195].any()
+    told[:, 200:] = 0.99
+    assert devices(told, reach, line, picture, holes)[:, 155:285].any()
