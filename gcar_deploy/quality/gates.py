@@ -19,7 +19,6 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.types import Mask
 
 #: exact views of which vessels are cut are believed when they ask for a shift up to this, mm
 CUT_SHIFT_MM = 1.0
@@ -114,21 +113,28 @@ def check_consistency(
     for k, (view, value) in enumerate(zip(views, disagreement, strict=True)):
         other = views[partners[k] if partners else 0]
         kind = kind_of((other, view))
-        findings += check_agreement((other.view_id, view.view_id), value, kind, options)
+        ids = other.view_id, view.view_id
+        cut = [seen.view_id for seen in (other, view) if is_cut(seen)]
+        findings += check_agreement(ids, value, kind, options, cut)
     return findings
 
 
 def check_agreement(
-    view_ids: tuple[str, str], disagreement: float, kind: str, options: QualityOptions
-) -> list[str]:
-    """Judge the disagreement of two views, 0 .. 1; returns and raises as ``check_consistency``."""
+    view_ids: tuple[str, str], disagreement: float, kind: str, options: QualityOptions,
+    cut: Sequence[str] = (),
+) -> list[str]:  # fmt: skip
+    """Judge the disagreement of two views, 0 .. 1; returns and raises as ``check_consistency``.
+
+    ``cut``: the views that vessels run out of.
+    """
     first, second = view_ids
     good, most = disagreement_limits(kind, options)
     if disagreement > most:
+        why = f"vessels run out of view {cut[0]}, or " if cut else ""
         raise RefusedError(
             f"views {first} and {second} contradict each other: the vessels "
             f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
-            "different patients, frames or angles?"
+            f"{why}different patients, frames or angles?"
         )
     if disagreement > (min(good, options.sure_disagreement_raw) if kind == "raw" else good):
         return [
@@ -194,7 +200,7 @@ def check_poses(
     findings = []
     hidden = ": the same move within the plane of the beams would leave no trace"
     # Exact profiles agree to a part in a hundred, and a cut vessel takes more from one of them.
-    cut = [view.view_id for view in views if view.calibrated and _is_cut(view.mask)]
+    cut = [view.view_id for view in views if view.calibrated and is_cut(view)]
     for view, (shift, turn) in zip(views, corrections, strict=True):
         if shift > options.good_shift_mm or turn > options.good_turn_deg:
             findings.append(
@@ -243,9 +249,11 @@ def check_motion(
     return findings
 
 
-def _is_cut(mask: Mask) -> bool:
-    """Whether vessels reach the border of their picture."""
-    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+def is_cut(view: VesselImage) -> bool:
+    """Whether vessels run out of a picture that holds nothing else: a path length or a mask."""
+    mask = view.mask
+    told = view.calibrated or view.kind == "mask"
+    return told and bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def check_asked(

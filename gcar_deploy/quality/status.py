@@ -19,7 +19,7 @@ from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
 from gcar_deploy.quality.anatomy import check_anatomy
 from gcar_deploy.quality.border import check_border
-from gcar_deploy.quality.gates import best_separation, disagreement_limits, kind_of
+from gcar_deploy.quality.gates import best_separation, disagreement_limits, is_cut, kind_of
 from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.hidden_ends import check_hidden_ends
 from gcar_deploy.quality.human_range import check_human_range
@@ -179,7 +179,8 @@ def assess(
         view_quality(tree, view, inside, options, _across(view, views))
         for view, inside in zip(views, lumen, strict=True)
     ]
-    findings = [*findings, *check_explained(judged, disagreement, kind_of(views), options)]
+    cut = [view.view_id for view in views if is_cut(view)]
+    findings = [*findings, *check_explained(judged, disagreement, kind_of(views), options, cut)]
     return Quality(
         status=DEGRADED if findings else OK,
         sentence=_sentence(findings, tree, len(views)),
@@ -195,6 +196,7 @@ def check_explained(
     disagreement: float | None,
     kind: str,
     options: QualityOptions,
+    cut: Sequence[str] = (),
 ) -> list[str]:
     """Judge how much of the pictures a tree explains, and how much of it they show.
 
@@ -203,6 +205,7 @@ def check_explained(
     views : what the comparison of each picture with the tree gave
     disagreement : worst epipolar disagreement, None if it was not measured
     kind : of the pictures, see ``kind_of``
+    cut : views that vessels run out of; what is cut off there is in no tree
 
     Raises
     ------
@@ -213,14 +216,23 @@ def check_explained(
     doubtful = (disagreement or 0.0) > disagreement_limits(kind, options)[0]
     several = len(views) > 2 and kind != "exact"
     enough = options.enough_coverage if several else options.good_coverage
+    even = {one.view_id: one.coverage_even or 0.0 for one in views}
+    # A tree of all that such a view shows leaves lines of the others unexplained.
+    whole = {name for name in cut if even[name] >= options.good_coverage}
     for one in views:
         # A tree of two patients misses thin vessels first.
-        if doubtful and (one.coverage_even or 0.0) < enough:
-            raise RefusedError(
-                f"the views contradict each other: {disagreement:.0%} of the vessels differ along "
-                f"the epipolar lines, and no tree explains more than "
-                f"{one.coverage_even or 0.0:.0%} of the lines in view {one.view_id}; "
-                "different patients, frames or angles?"
+        if doubtful and even[one.view_id] < enough:
+            if not whole - {one.view_id}:
+                raise RefusedError(
+                    f"the views contradict each other: {disagreement:.0%} of the vessels differ "
+                    f"along the epipolar lines, and no tree explains more than "
+                    f"{even[one.view_id]:.0%} of the lines in view {one.view_id}; "
+                    "different patients, frames or angles?"
+                )
+            findings.append(
+                f"view {one.view_id}: only {even[one.view_id]:.0%} of the lines are explained; "
+                f"vessels run out of view {min(whole - {one.view_id})}, and what is cut off there "
+                "is in no tree"
             )
         for value, least, good, what in (
             (one.coverage, options.min_coverage, options.good_coverage,

@@ -91,6 +91,25 @@ def test_several_views_that_agree_poorly_may_leave_more_unexplained_than_two(cas
             judged(even, count, of)
 
 
+@pytest.mark.parametrize(("cut", "even", "refused"), [
+    ([], 0.95, True), (["1"], 0.95, False), (["1"], 0.85, True), (["2"], 0.95, True),
+])  # fmt: skip
+def test_what_is_cut_off_in_one_view_is_missing_from_the_tree(case, cut, even, refused):
+    _, views, tree = case
+    one = view_quality(tree, views[0], views[0].mask, OPTIONS)
+    seen = [
+        dataclasses.replace(one, view_id=name, coverage=0.95, support=0.95, coverage_even=share)
+        for name, share in (("1", even), ("2", 0.75))
+    ]
+    doubt = OPTIONS.good_disagreement + 0.01
+    if refused:
+        with pytest.raises(RefusedError, match="contradict"):
+            check_explained(seen, doubt, "exact", OPTIONS, cut)
+    else:
+        (said,) = check_explained(seen, doubt, "exact", OPTIONS, cut)
+        assert "75%" in said and "view 1" in said and "cut off" in said
+
+
 def test_match_rate_and_strict_coverage(case):
     _, views, tree = case
     quality = view_quality(tree, views[0], views[0].mask, OPTIONS, views[1])
