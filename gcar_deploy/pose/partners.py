@@ -118,8 +118,11 @@ def partnered(
         ways += len(tried)
         fitted = [estimate(each) for each, _ in tried]
         after = [worst_of(some) / gain for some, (_, gain) in zip(fitted, tried, strict=True)]
-        if after and min(after) <= left:
-            best = after.index(min(after))
+        shown = _shares([each for each, _ in tried])
+        better = [k for k, left_then in enumerate(after) if left_then <= left]
+        if better:
+            # Who shows less disagrees about less.
+            best = min(better, key=lambda k: after[k] / shown[k])
             now, poses = tried[best][0], fitted[best]
             continue
         if len(now) > 2 or left <= contradict:
@@ -133,6 +136,12 @@ def partnered(
         ]
         now, poses = closer
     return now, poses
+
+
+def _shares(tried: Sequence[Views]) -> list[float]:
+    """Share of the lines of the fullest that each of some ways shows, of its emptiest view."""
+    lengths = np.array([[view.skeleton.sum() for view in each] for each in tried], float)
+    return list((lengths / np.maximum(lengths.max(axis=0), 1.0)).min(axis=1)) if len(tried) else []
 
 
 def _mostly(part: Mask, whole: Mask) -> bool:

@@ -134,6 +134,20 @@ def test_a_lost_line_comes_back_where_the_views_agree_far_better_with_it(before,
     assert left[0] is views[0]
 
 
+def test_a_vessel_comes_back_rather_than_its_twin_goes():
+    """Without it in the one view or with it in the other the views agree about as well."""
+    whole = crossed(0.0)
+    lost = without_line(view_of(VESSEL, CROSSING), view_of(CROSSING).skeleton)
+    views = [dataclasses.replace(lost, kept=lambda: whole), crossed(SURE, 90.0)]
+    agree = {(True, True): 1.1 * ENOUGH, (False, False): ENOUGH}
+
+    def estimate(tried):
+        return poses(agree.get((there(tried[0]), there(tried[1])), 2 * ENOUGH))
+
+    kept, _ = partnered(views, estimate(views), (True, True), ENOUGH, CONTRADICT, estimate, never)
+    assert [there(view) for view in kept] == [True, True]
+
+
 @pytest.mark.parametrize("both", [False, True])
 def test_what_comes_from_outside_in_two_views_is_a_catheter(both):
     """One view would agree far better with its line back; the other has lost such a line, too."""
