@@ -21,8 +21,8 @@ def validate(order: Order, talk: Talk) -> None:
     """Check pictures and their geometry without reconstructing.
 
     Says how far apart the views are, how they magnify, how much of the volume each covers,
-    whether they can show the same tree, and what ``gcar run`` would refuse and why; ends with
-    the exit code that ``gcar run`` would give.
+    whether they can show the same tree, and what ``gcar run`` would refuse and why before it
+    makes a tree; ends with the exit code that ``gcar run`` would give then.
 
     \b
     Example:
