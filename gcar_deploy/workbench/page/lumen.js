@@ -113,7 +113,7 @@ export class Curve {
       ctx.strokeStyle = "#8a6d00"; ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(s), top); ctx.lineTo(x(s), bottom); ctx.stroke();
       ring(ctx, x(s), y(2 * part.branch.radius[cursor.at]), 5, "#ffe14d", "#1a2230");
     }
-    $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: least diameter.";
+    $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: least diameter; shaded: lesion.";
   }
   axes(ctx, { left, right, top, bottom, most, length, x, y }) {
     ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = "#525c6b"; ctx.strokeStyle = "#e3e8ee"; ctx.lineWidth = 1;
