@@ -33,10 +33,12 @@ class OwnFrame:
     ----------
     order : (V,) which view of the file stands first, second ...
     origin_mm : (3,) the scene's middle in the file's coordinates, mm LPS
+    sdd_mm : (V,) source to detector in that order, as told; ``carm`` does not keep it
     """
 
     order: tuple[int, ...]
     origin_mm: Points
+    sdd_mm: tuple[float, ...]
 
     def place(self, view: int) -> int:
         """Return where the file's view stands in the scene's own order."""
@@ -108,7 +110,7 @@ def own_frame(carms: Sequence[CArm], names: Sequence[str]) -> OwnFrame:
         left += across
         right += across @ carms[k].source_mm
     origin = np.linalg.lstsq(left, right, rcond=1e-6)[0].astype(np.float64)
-    return OwnFrame(order=tuple(order), origin_mm=origin)
+    return OwnFrame(tuple(order), origin, tuple(carms[k].sdd_mm for k in order))
 
 
 def _even(value: float) -> float:

@@ -63,6 +63,7 @@ class StepFolder:
         check_target(folder, force=False)
         self._folder = folder
         self._origin_mm: Points = np.zeros(3)
+        self._sdd_mm: tuple[float, ...] = ()
         try:
             folder.mkdir(parents=True)
         except OSError as error:
@@ -71,7 +72,7 @@ class StepFolder:
     def __call__(self, step: Step) -> None:
         """Write a step."""
         if isinstance(step, OwnFrame):
-            self._origin_mm = step.origin_mm
+            self._origin_mm, self._sdd_mm = step.origin_mm, step.sdd_mm
             return
         try:
             for name, data in self._files(step):
@@ -89,7 +90,8 @@ class StepFolder:
         elif isinstance(step, Registered):
             for view in step.views:
                 yield f"2-pose-view{_name(view)}-mask.png", _drawn(view.mask)
-            beams = np.concatenate([_beam(view) for view in step.views]) + self._origin_mm
+            each = [_beam(*one) for one in zip(step.views, self._sdd_mm, strict=True)]
+            beams = np.concatenate(each) + self._origin_mm
             names = [_name(view) for view in step.views]
             yield "2-pose.vtp", poly_data(beams, [3] * len(names), {}, {"View": names})
         elif isinstance(step, Seen):
@@ -129,10 +131,10 @@ def _drawn(picture: Array) -> bytes:
     return png_bytes(np.rint(np.clip(picture / most, 0, 1) * 255).astype(np.uint8))
 
 
-def _beam(view: VesselImage) -> Points:
+def _beam(view: VesselImage, sdd_mm: float) -> Points:
     """(3, 3) source, the point of the central ray nearest to the scene's middle, detector."""
     source, ray = view.carm.source_mm, view.carm.axes[2]
-    return np.stack([source, source - (source @ ray) * ray, source + view.carm.sdd_mm * ray])
+    return np.stack([source, source - (source @ ray) * ray, source + sdd_mm * ray])
 
 
 def _lines(tree: Tree) -> bytes:

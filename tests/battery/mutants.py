@@ -31,21 +31,21 @@ class Mutant:
 MUTANTS = (
     Mutant(
         "geometry: sign of the secondary angle",
-        "gcar_deploy/geometry/carm.py",
+        "gcar_deploy/geometry/matrix.py",
         "for x in (primary_deg, secondary_deg, rotation_deg))",
         "for x in (primary_deg, -secondary_deg, rotation_deg))",
         (_CARM,),
     ),
     Mutant(
         "geometry: degrees taken for radians",
-        "gcar_deploy/geometry/carm.py",
+        "gcar_deploy/geometry/matrix.py",
         "a, b, g = (math.radians(x) for x in",
         "a, b, g = (x for x in",
         (_CARM,),
     ),
     Mutant(
         "geometry: detector rotation the other way",
-        "gcar_deploy/geometry/carm.py",
+        "gcar_deploy/geometry/matrix.py",
         "return u * cg - v * sg, u * sg + v * cg, d",
         "return u * cg + v * sg, v * cg - u * sg, d",
         (_CARM,),
