@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.errors import GeometryError
-from gcar_deploy.geometry.matrix import applied, axes, checked, read_off
+from gcar_deploy.geometry.matrix import ReadOff, applied, axes, checked, read_off
 from gcar_deploy.types import Array, Pixels, Points, Scalars
 
 #: key -> (lowest, highest, unit) of what is accepted at all.
@@ -165,19 +165,23 @@ class CArm:
         """
         P = checked(matrix)
         told = read_off(P)
-        sdd = SDD_OVER_SOD * told.sod_mm
+        view = cls.from_reading(told, SDD_OVER_SOD * told.sod_mm, rows=rows, columns=columns)
+        return dataclasses.replace(view, projection_matrix=tuple(map(tuple, P.tolist())))
+
+    @classmethod
+    def from_reading(cls, told: ReadOff, sdd_mm: float, *, rows: int, columns: int) -> CArm:
+        """Build a view from what a matrix says of it, and from where its detector stands."""
         return cls(
             primary_angle_deg=told.primary_deg,
             secondary_angle_deg=told.secondary_deg,
             detector_rotation_deg=told.rotation_deg,
             sod_mm=told.sod_mm,
-            sdd_mm=sdd,
+            sdd_mm=sdd_mm,
             rows=rows,
             columns=columns,
-            pixel_spacing_mm=(sdd / told.focal_px[1], sdd / told.focal_px[0]),
+            pixel_spacing_mm=(sdd_mm / told.focal_px[1], sdd_mm / told.focal_px[0]),
             principal_point_px=told.principal_point_px,
             isocenter_offset_mm=told.offset_mm,
-            projection_matrix=tuple(map(tuple, P.tolist())),
         )
 
     # -- matrices -------------------------------------------------------------------------

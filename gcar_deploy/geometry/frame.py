@@ -15,7 +15,7 @@ import numpy as np
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import HARD_RANGES, SDD_OVER_SOD, CArm
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.geometry.matrix import read_off
+from gcar_deploy.geometry.matrix import read_off, rounded
 from gcar_deploy.types import Points
 
 #: geometry nearer than this is the same geometry: mm, pixels, degrees; far below what any gantry
@@ -51,34 +51,23 @@ class OwnFrame:
         distances, by a matrix, or by both.
         """
         own = carm.moved(self.origin_mm)
-        try:
-            told = read_off(own.world2pixel)
-        except GeometryError:
-            # Beside angles a matrix may be a little skewed, which they do not say.
-            return own
-        sod, (f_col, f_row) = _even(told.sod_mm), map(_even, told.focal_px)
-        # Nothing but the size of things at the isocentre is told, unless it is out of all ranges.
         low, high, _ = HARD_RANGES["pixel_spacing_mm"]
-        usual = low * max(f_col, f_row) <= SDD_OVER_SOD * sod <= high * min(f_col, f_row)
-        sdd = (SDD_OVER_SOD if usual else own.magnification) * sod
-        column, row = map(_even, told.principal_point_px)
-        x, y, z = map(_even, told.offset_mm)
-        return CArm(
-            primary_angle_deg=_even(told.primary_deg),
-            secondary_angle_deg=_even(told.secondary_deg),
-            detector_rotation_deg=_even(told.rotation_deg),
-            sod_mm=sod,
-            sdd_mm=sdd,
-            rows=own.rows,
-            columns=own.columns,
-            pixel_spacing_mm=(sdd / f_row, sdd / f_col),
-            principal_point_px=(column, row),
-            isocenter_offset_mm=(x, y, z),
-        )
+        try:
+            told = read_off(own.world2pixel).rounded(GRAIN_DIGITS)
+            # Nothing but the size of things at the isocentre is told; pixels stay within range.
+            least, most = low * max(told.focal_px), high * min(told.focal_px)
+            sdd = min(max(SDD_OVER_SOD * told.sod_mm, least), most)
+            return CArm.from_reading(told, sdd, rows=own.rows, columns=own.columns)
+        except GeometryError:
+            # Beside angles a matrix may be a little skewed, which they do not say; or the view is
+            # at the very end of a range.
+            return own
 
     def grid(self, grid: Grid) -> Grid:
         """Return a grid in the scene's own coordinates."""
-        x, y, z = (_even(float(c)) for c in np.asarray(grid.center_mm) - self.origin_mm)
+        x, y, z = (
+            rounded(float(c), GRAIN_DIGITS) for c in np.asarray(grid.center_mm) - self.origin_mm
+        )
         return dataclasses.replace(grid, center_mm=(x, y, z))
 
 
@@ -111,7 +100,3 @@ def own_frame(carms: Sequence[CArm], names: Sequence[str]) -> OwnFrame:
         right += across @ carms[k].source_mm
     origin = np.linalg.lstsq(left, right, rcond=1e-6)[0].astype(np.float64)
     return OwnFrame(tuple(order), origin, tuple(carms[k].sdd_mm for k in order))
-
-
-def _even(value: float) -> float:
-    return round(value, GRAIN_DIGITS) + 0.0  # no negative zero

@@ -10,6 +10,9 @@ import numpy as np
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.types import Array, Points
 
+#: voxels of a grid
+MOST_VOXELS = 2**28
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Grid:
@@ -35,7 +38,7 @@ class Grid:
             raise GeometryError(f"volume.size_mm = {self.size_mm!r} is outside 1 .. 2000 mm")
         if any(int(n) != n or not 1 <= n <= 1024 for n in self.shape):
             raise GeometryError(f"volume.shape = {self.shape!r} is outside 1 .. 1024 voxels")
-        if math.prod(self.shape) > 2**28:
+        if math.prod(self.shape) > MOST_VOXELS:
             raise GeometryError(f"volume.shape = {self.shape!r} has more than 2^28 voxels")
 
     @property

@@ -6,6 +6,7 @@ The conventions are those of ``carm``: P = K [R | t], world mm LPS to pixels.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -38,6 +39,26 @@ class ReadOff:
     focal_px: tuple[float, float]
     principal_point_px: tuple[float, float]
     offset_mm: tuple[float, float, float]
+
+    def rounded(self, digits: int) -> ReadOff:
+        """Return the same with every number to so many digits."""
+        even = functools.partial(rounded, digits=digits)
+        (f_col, f_row), (col, row) = self.focal_px, self.principal_point_px
+        x, y, z = map(even, self.offset_mm)
+        return ReadOff(
+            primary_deg=even(self.primary_deg),
+            secondary_deg=even(self.secondary_deg),
+            rotation_deg=even(self.rotation_deg),
+            sod_mm=even(self.sod_mm),
+            focal_px=(even(f_col), even(f_row)),
+            principal_point_px=(even(col), even(row)),
+            offset_mm=(x, y, z),
+        )
+
+
+def rounded(value: float, digits: int) -> float:
+    """Round, without a negative zero."""
+    return round(value, digits) + 0.0
 
 
 def checked(matrix: Any) -> Array:

@@ -25,7 +25,6 @@ _NEAR_MM, _TURN_DEG, _WAY_MM, _AS_WIDE = 2.5, 25.0, (3.0, 6.0), 1.5
 #: generated pictures (seeds 88001, 88002, 91101, 91102, 91202) 10 join three, all of them vessels,
 #: and 17 go on at two, 14 of them vessels
 _JOINS, _GOES_ON = 3, 2
-_BLOCK = np.ones((3, 3), np.uint8)
 
 
 def device_map(
@@ -117,11 +116,10 @@ def is_between(part: Mask, rest: Mask, half: Image, pixel_mm: float) -> bool:
     half : (rows, cols) float32, half the width of what the line is the middle of, pixels
     pixel_mm : float
     """
-    neighbours = cv2.filter2D(part.astype(np.uint8), -1, _BLOCK, borderType=cv2.BORDER_CONSTANT)
     own, others = np.argwhere(part), np.argwhere(rest)
     label = cv2.connectedComponents(rest.astype(np.uint8), connectivity=8)[1][rest]
     width, joins, going = float(np.median(half[part])), 0, 0
-    for end in np.argwhere(part & (neighbours <= 2)):
+    for end in np.argwhere(part & (skel.neighbours(part) <= 1)):
         far = pixel_mm * np.linalg.norm(own - end, axis=1)
         before = own[(far > _WAY_MM[0] - 1) & (far < _WAY_MM[1] - 1)]
         ahead = others - end

@@ -18,7 +18,7 @@ from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses, worst_of
-from gcar_deploy.pose.partners import GAIN, partnered
+from gcar_deploy.pose.partners import GAIN, partnered, shown_share
 from gcar_deploy.quality import check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
@@ -149,20 +149,11 @@ def _closest(
     whole = views
     for read in readings:
         closer = poses_between(read, options)
-        after, kept = worst_of(closer), _kept(read, whole)
+        after, kept = worst_of(closer), shown_share(read, whole)
         if limits.alone_ratio * after < kept * worst:
             _log.info("the views agree better by what one method sees of them, or without rims")
             views, poses, worst = read, closer, after / kept
     return views, poses
-
-
-def _kept(read: Sequence[VesselImage], whole: Sequence[VesselImage]) -> float:
-    """Share of their lines that readings of views keep, 0 .. 1, of the view that loses most."""
-    shares = [
-        float(one.skeleton.sum()) / max(float(view.skeleton.sum()), 1.0)
-        for one, view in zip(read, whole, strict=True)
-    ]
-    return min(1.0, *shares)
 
 
 def _by_method(

@@ -118,11 +118,12 @@ def partnered(
         ways += len(tried)
         fitted = [estimate(each) for each, _ in tried]
         after = [worst_of(some) / gain for some, (_, gain) in zip(fitted, tried, strict=True)]
-        shown = _shares([each for each, _ in tried])
         better = [k for k, left_then in enumerate(after) if left_then <= left]
         if better:
             # Who shows less disagrees about less.
-            best = min(better, key=lambda k: after[k] / shown[k])
+            of_each = zip(*(way for way, _ in tried), strict=True)
+            fullest = [max(same, key=_length) for same in of_each]
+            best = min(better, key=lambda k: after[k] / shown_share(tried[k][0], fullest))
             now, poses = tried[best][0], fitted[best]
             continue
         if len(now) > 2 or left <= contradict:
@@ -138,10 +139,16 @@ def partnered(
     return now, poses
 
 
-def _shares(tried: Sequence[Views]) -> list[float]:
-    """Share of the lines of the fullest that each of some ways shows, of its emptiest view."""
-    lengths = np.array([[view.skeleton.sum() for view in each] for each in tried], float)
-    return list((lengths / np.maximum(lengths.max(axis=0), 1.0)).min(axis=1)) if len(tried) else []
+def shown_share(views: Views, fuller: Views) -> float:
+    """Share of the lines of fuller views that are shown, 0 .. 1, of the view that lacks most."""
+    return min(
+        1.0,
+        *(_length(one) / max(_length(full), 1.0) for one, full in zip(views, fuller, strict=True)),
+    )
+
+
+def _length(view: VesselImage) -> float:
+    return float(view.skeleton.sum())
 
 
 def _mostly(part: Mask, whole: Mask) -> bool:

@@ -11,16 +11,15 @@ import itertools
 
 import numpy as np
 
-from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.grid import MOST_VOXELS, Grid
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Points, Scalars, Volume
 
 #: samples per voxel edge where the surface passes through.
 SAMPLES = 3
-#: wider voxels are summed up from finer ones: their samples would miss the vessels, mm
+#: wider voxels are summed up from finer ones, if a Grid may have so many: their samples would miss
+#: the vessels, mm
 WIDEST_MM = 4.0
-#: unless those were more than a Grid may have
-MOST_FINE = 2**28
 #: capsule-voxel pairs handled at once: what is made of them stays in the cache
 CHUNK = 80_000
 
@@ -48,7 +47,7 @@ def sparse_occupancy(tree: Tree, grid: Grid) -> tuple[Array, Array]:
     """Like ``tree_occupancy``, but only (n,) flat voxel indices and their coverage."""
     parts = np.ceil(grid.spacing_mm / WIDEST_MM).astype(np.int64)
     shape = parts * grid.shape
-    if parts.max() > 1 and shape.prod() <= MOST_FINE:
+    if parts.max() > 1 and shape.prod() <= MOST_VOXELS:
         fine = dataclasses.replace(grid, shape=tuple(shape.tolist()))
         voxel, coverage = sparse_occupancy(tree, fine)
         at = np.stack(np.unravel_index(voxel, fine.shape)) // parts[:, None]

@@ -71,10 +71,10 @@ def test_a_view_told_by_its_matrix_is_the_view_told_by_angles(factor, shift) -> 
         assert [frame.carm(c) for c in carms] == [base.carm(c) for c in views]
 
 
-@pytest.mark.parametrize("pitch", [0.021, 9.9])
+@pytest.mark.parametrize("pitch", [0.02, 0.021, 9.9, 10.0])
 def test_views_of_the_finest_and_the_widest_pixels_have_a_frame(pitch: float) -> None:
     carms = [dataclasses.replace(carm, pixel_spacing_mm=(pitch, pitch)) for carm in VIEWS[::2]]
-    carms = [dataclasses.replace(carm, sdd_mm=770 if pitch > 1 else 1800) for carm in carms]
+    carms = [dataclasses.replace(carm, sdd_mm=771.2345678 if pitch > 1 else 1800) for carm in carms]
     frame = own_frame(carms, "ab")
     for carm in carms:
         own = frame.carm(carm).project(POINTS - frame.origin_mm)
