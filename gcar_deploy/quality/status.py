@@ -222,7 +222,7 @@ def check_explained(
     for one in views:
         # A tree of two patients misses thin vessels first.
         if doubtful and even[one.view_id] < enough:
-            if not whole - {one.view_id}:
+            if not whole:
                 raise RefusedError(
                     f"the views contradict each other: {disagreement:.0%} of the vessels differ "
                     f"along the epipolar lines, and no tree explains more than "
@@ -231,7 +231,7 @@ def check_explained(
                 )
             findings.append(
                 f"view {one.view_id}: only {even[one.view_id]:.0%} of the lines are explained; "
-                f"vessels run out of view {min(whole - {one.view_id})}, and what is cut off there "
+                f"vessels run out of view {min(whole)}, and what is cut off there "
                 "is in no tree"
             )
         for value, least, good, what in (

@@ -177,6 +177,7 @@ BEFORE, AFTER = [(20, 96), (79, 100)], [(121, 100), (180, 104)]
     ([BEFORE, [(121, 100), (150, 150)]], False),
     # Three lines meet in it.
     ([BEFORE, [(121, 100), (150, 150)], [(100, 95), (100, 20)]], True),
+    ([[(79, 100), (60, 20)], [(121, 100), (150, 150)], [(100, 95), (180, 60)]], True),
 ])  # fmt: skip
 def test_what_vessels_go_on_from_is_no_device(rest, one):
     (stretch,) = lines(STRETCH)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.imaging.stray_lines import without_line
+from gcar_deploy.pose import partners
 from gcar_deploy.pose.pairwise import Pose
 from gcar_deploy.pose.partners import BACK_GAIN, GAIN, LIKELY, MOST_FITTED, partnered
 from tests.imaging.test_stray_lines import CROSSING, MIDDLE, VESSEL, view_of
@@ -68,6 +69,11 @@ def test_a_likely_device_goes_where_the_views_agree_a_little_better_without_it()
 
 def test_it_stays_where_they_agree_less_without_it():
     assert asked((SURE, 0.0), lambda one, two: AGREED if one else 1.2 * AGREED) == [True, True]
+
+
+def test_no_more_ways_are_asked_than_are_worth_it(monkeypatch):
+    monkeypatch.setattr(partners, "MOST_WAYS", 0)
+    assert asked((SURE, 0.0), better) == [True, True]
 
 
 def test_what_is_no_likely_device_is_not_asked_while_the_views_agree():
