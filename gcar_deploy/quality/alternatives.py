@@ -17,11 +17,14 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.epipolar import plane_angles, reach_mm
 from gcar_deploy.quality.shown import CELLS_OFF, CELLS_ON, Shown
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.edit import kept_branches
+from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Scalars
 
 #: stretches shorter than this are left out, mm
 MIN_LENGTH_MM = 20.0
+#: a branch with a free end that is shorter than this is a spur, which parts no vessel in two, mm
+SPUR_MM = 10.0
 #: a vessel turns back where it goes on by at least so much on either side, mm across the planes
 TURN_MM = 4.0
 #: profiles are compared in bins of this width at the isocentre, smoothed over a bin
@@ -87,8 +90,12 @@ def exchanges(tree: Tree, carms: Sequence[CArm], *, masks: bool = False) -> tupl
     """
     if len(carms) != 2:
         return ()
-    numbers = range(len(tree.branches))
-    ways = [way for number in numbers for way in _ways(tree, number, carms, masks)]
+    whole = [((number,), branch) for number, branch in enumerate(tree.branches)]
+    ways = [
+        way
+        for numbers, vessel in (*whole, *_past_spurs(tree))
+        for way in _ways(tree, numbers, vessel, carms, masks)
+    ]
     if len(ways) < 2:
         return ()
     low = min(way.at_mm.min() for way in ways) - 2 * BIN_MM
@@ -97,10 +104,13 @@ def exchanges(tree: Tree, carms: Sequence[CArm], *, masks: bool = False) -> tupl
     most = MOST_WIDTH_DIFFERENCE if masks else MOST_DIFFERENCE
     found = []
     for a, b in itertools.combinations(range(len(ways)), 2):
-        whole = float(profiles[a].sum() + profiles[b].sum())
-        difference = float(np.abs(profiles[a] - profiles[b]).sum()) / max(whole, 1e-9)
+        one, two = ways[a], ways[b]
+        if one.numbers != two.numbers and set(one.numbers) & set(two.numbers):
+            # A vessel and a branch of its own.
+            continue
+        shown = float(profiles[a].sum() + profiles[b].sum())
+        difference = float(np.abs(profiles[a] - profiles[b]).sum()) / max(shown, 1e-9)
         if difference < most:
-            one, two = ways[a], ways[b]
             found.append(
                 Exchange(
                     branches=(one.branch, two.branch),
@@ -138,33 +148,60 @@ def evidence_elsewhere(shown: Shown) -> float | None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Way:
-    """A stretch of a branch that crosses the epipolar planes one way.
+    """A stretch of a vessel that crosses the epipolar planes one way.
 
     Attributes
     ----------
-    branch, stretch_mm : of the tree; from, to along it
+    numbers : of the branches that the vessel consists of
+    branch, stretch_mm : the longest of them; from, to along it
     at_mm : (n,) epipolar plane of each segment, mm at the isocentre
     shown : (n,) what the pictures show of each: its volume, mm^3, or, of masks, its radius times
         the planes that it crosses, mm^2
     """
 
+    numbers: tuple[int, ...]
     branch: int
     stretch_mm: tuple[float, float]
     at_mm: Scalars
     shown: Scalars
 
 
-def _ways(tree: Tree, number: int, carms: Sequence[CArm], masks: bool) -> list[_Way]:
-    """Cut a branch where it turns back; stretches of some length."""
-    branch = tree.branches[number]
-    arc = branch.arc_mm
-    pixels, _ = carms[0].project(branch.points_mm)
+def _past_spurs(tree: Tree) -> list[tuple[tuple[int, ...], Branch]]:
+    """Vessels that spurs part into several branches, each with the numbers of those."""
+    free = tree.degrees == 1
+    spur = np.array(
+        [one.length_mm < SPUR_MM and (free[one.start] or free[one.end]) for one in tree.branches]
+    )
+    out = []
+    for vessel in kept_branches(tree, ~spur).branches:
+        own = [
+            number
+            for number in np.flatnonzero(~spur).tolist()
+            if (vessel.points_mm == _middle(tree.branches[number])).all(axis=1).any()
+        ]
+        if len(own) > 1:
+            out.append((tuple(own), vessel))
+    return out
+
+
+def _middle(branch: Branch) -> Array:
+    return branch.points_mm[len(branch) // 2]
+
+
+def _ways(
+    tree: Tree, numbers: tuple[int, ...], vessel: Branch, carms: Sequence[CArm], masks: bool
+) -> list[_Way]:
+    """Cut a vessel of these branches where it turns back; stretches of some length."""
+    longest = max(numbers, key=lambda number: tree.branches[number].length_mm)
+    ends = (0.0, tree.branches[longest].length_mm) if len(numbers) > 1 else None
+    arc = vessel.arc_mm
+    pixels, _ = carms[0].project(vessel.points_mm)
     at = plane_angles(carms[0], carms[1], carms[0], pixels) * reach_mm(carms[0], carms[1])
-    radius = 0.5 * (branch.radius_mm[1:] + branch.radius_mm[:-1])
+    radius = 0.5 * (vessel.radius_mm[1:] + vessel.radius_mm[:-1])
     shown = radius * np.abs(np.diff(at)) if masks else np.pi * radius**2 * np.diff(arc)
     middle = 0.5 * (at[1:] + at[:-1])
     return [
-        _Way(number, (float(arc[i]), float(arc[j])), middle[i:j], shown[i:j])
+        _Way(numbers, longest, ends or (float(arc[i]), float(arc[j])), middle[i:j], shown[i:j])
         for i, j in itertools.pairwise(turning_points(at, TURN_MM))
         if arc[j] - arc[i] >= MIN_LENGTH_MM
     ]
