@@ -63,12 +63,24 @@ class Run:
             )
         return State(tree_of(tubes, tree), tubes, prior, prints)
 
-    def tried(self, tree: Tree, targets: list[Target]) -> Trial:
-        """Fit at the last level; of that the run remembers no more than that it was stopped."""
-        aside = dataclasses.replace(self, progress=Progress())
+    def tried(self, tree: Tree, targets: list[Target], hopeless: float = np.inf) -> Trial:
+        """Fit at the last level; of that the run remembers no more than that it was stopped.
+
+        An objective above ``hopeless`` after one step, or twice that much before, ends the fit:
+        further steps gain less than the first.
+        """
+        own = Progress()
+
+        def in_vain() -> bool:
+            return len(own.losses) < 3 and own.losses[-1] > (3 - len(own.losses)) * hopeless
+
+        def stop() -> bool:
+            return in_vain() or (self.should_stop is not None and self.should_stop())
+
+        aside = dataclasses.replace(self, progress=own, should_stop=stop)
         state = aside.fit(tree, targets, self.options.steps[-1])
-        self.progress.stopped |= aside.progress.stopped
-        return Trial(state, aside.progress)
+        self.progress.stopped |= own.stopped and not in_vain()
+        return Trial(state, own)
 
 
 def started_at(tree: Tree, options: TubeOptions, pixel_mm: float = np.inf) -> tuple[Tubes, Prior]:

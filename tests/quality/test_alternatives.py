@@ -7,6 +7,7 @@ from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.predict import Evidence
 from gcar_deploy.quality.alternatives import evidence_elsewhere, exchanges, findings, turning_points
 from gcar_deploy.quality.shown import Shown
+from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import Tree
 from tests.hard.phantoms import PAIR, bars, carm, seven, straight
 from tests.tree.shapes import branch
@@ -39,6 +40,35 @@ def test_vessels_that_differ_in_mass_or_place_cannot_be_exchanged(change):
     else:
         second = dataclasses.replace(second, points_mm=second.points_mm + np.array([0, 0, 12.0]))
     assert exchanges(dataclasses.replace(two, branches=(first, second)), VIEWS) == ()
+
+
+def _with_twigs(tree, places, length_mm):
+    """A twig across each bar, ``places`` of the way along it."""
+    twig = np.linspace(0.0, length_mm, 8)[:, None] * np.array([0.6, 0.8, 0.0])
+    for bar, place in zip(tree.branches, places, strict=True):
+        line = bar.points_mm[round(place * (len(bar) - 1))] + twig
+        tree = with_branch(tree, line, 0.5, 1.0, 0.5)
+    return tree
+
+
+def test_vessels_are_the_same_past_the_spurs_that_part_them():
+    parted = _with_twigs(bars(2), (0.35, 0.65), 6.0)
+    (found,) = exchanges(parted, VIEWS)
+    assert found.difference < 0.15
+    for number, (start, end) in zip(found.branches, found.stretches_mm, strict=True):
+        assert start == 0.0
+        assert end == parted.branches[number].length_mm == pytest.approx(26.0, abs=1.0)
+    # A branch of some length parts a vessel in two.
+    assert exchanges(_with_twigs(bars(2), (0.35, 0.65), 14.0), VIEWS) == ()
+
+
+def test_no_vessel_is_exchanged_with_its_own_branch():
+    """A spur parts it into 90 and 12 mm: the whole differs from the former by 6 %."""
+    line = np.linspace(-51.0, 51.0, 103)[:, None] * np.array([0.0, 0.0, 1.0])
+    one = Tree(nodes_mm=line[[0, -1]], branches=(branch(line, np.full(103, 1.2)),))
+    parted = _with_twigs(one, (90 / 102,), 6.0)
+    assert len(parted.branches) == 3
+    assert exchanges(parted, VIEWS) == ()
 
 
 def hairpin(thinner: float = 1.0):

@@ -36,6 +36,16 @@ def test_what_hangs_on_nothing_is_measured_and_given_up():
     assert len(left.branches) == len(base.branches)
 
 
+def test_what_hung_on_nothing_before_stays():
+    _, tree = _with_part(20.0)
+    far = tree.points().max(axis=0) + 40.0
+    line = far + np.linspace(0.0, 15.0, 12)[:, None] * np.array([0.0, 0.0, 1.0])
+    more = with_branch(tree, line, 0.8, 1.0, 0.5)
+    assert loose_mm(_hanging(more, tree)) == pytest.approx(20.0)
+    assert loose_mm(_hanging(tree, tree)) == pytest.approx(20.0)
+    assert loose_mm(_hanging(more)) == 0.0
+
+
 def test_a_short_part_stays():
     _, tree = _with_part(5.0)
     assert _hanging(tree).length_mm == pytest.approx(tree.length_mm)
