@@ -326,4 +326,11 @@ MUTANTS = (
         "return 0.0",
         ("tests/output/test_files.py",),
     ),
+    Mutant(
+        "tubes: vessels exchanged in the view that they do not cross in",
+        "gcar_deploy/tubes/exchange.py",
+        "pixels[view] = of[0][view][of[1]]",
+        "pixels[1 - view] = of[0][1 - view][of[1]]",
+        ("tests/tubes/test_exchange.py",),
+    ),
 )  # fmt: skip
