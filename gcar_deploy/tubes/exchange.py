@@ -30,6 +30,8 @@ from gcar_deploy.types import Array, Pixels, Points, Scalars
 CROSS_MM, APART_MM = 0.7, 2.0
 #: stretches are followed in steps of this length, mm, and as long as their planes are so near, mm
 STEP_MM, PLANE_MM = 0.75, 1.0
+#: lines with more pairs of places so near than this, to each place, run along the planes
+MOST_PAIRS = 20
 #: shorter stretches are not exchanged, mm
 LEAST_MM = 8.0
 #: the new course is smoothed over so many steps
@@ -111,12 +113,16 @@ def followed(first: Scalars, second: Scalars) -> Array:
     Returns
     -------
     (k, 2) places of both that are paired, in order: each step moves on by one place along either or
-    both, to planes at most ``PLANE_MM`` apart; the pairs' distances have the least sum
+    both, to planes at most ``PLANE_MM`` apart; the pairs' distances have the least sum. The first
+    alone where both run along the planes, so that any place could be that of any other
     """
     gap = np.abs(first[:, None] - second[None])
+    near = np.argwhere(gap <= PLANE_MM)
+    if len(near) > MOST_PAIRS * (len(first) + len(second)):
+        return np.zeros((1, 2), np.int64)
     # Cost so far, and the step back: all pairs that can be reached, a narrow band.
     best: dict[tuple[int, int], tuple[float, tuple[int, int]]] = {(0, 0): (gap[0, 0], (0, 0))}
-    for i, j in np.argwhere(gap <= PLANE_MM).tolist():
+    for i, j in near.tolist():
         before = [
             (best[back][0], back)
             for back in ((i - 1, j - 1), (i - 1, j), (i, j - 1))

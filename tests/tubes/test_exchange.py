@@ -137,6 +137,10 @@ def test_lines_are_followed_through_common_planes():
     # What goes on is not.
     assert up[followed(up, turned)[-1, 0]] <= 9.0 + PLANE_MM
     assert followed(up, -up)[-1].max() * 0.75 < LEAST_MM
+    # Along the planes all places are alike.
+    assert followed(0.02 * up, 0.02 * up).tolist() == [[k, k] for k in range(len(up))]
+    long = np.linspace(0.0, 0.9, 100)
+    assert followed(long, long).tolist() == [[0, 0]]
 
 
 @given(
