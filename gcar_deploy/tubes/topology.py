@@ -45,6 +45,8 @@ DOUBTED, UNEXPLAINED, BETTER = 0.09, 0.035, 0.03
 HOPELESS, TORN, MOST_IN_VAIN = 1.5, 1.2, 3
 #: ... and after the first of its steps, which gains the most, so many times as much
 FIRST_STEP = 1.2
+#: a tree whose vessels were exchanged must not hang on less: price of a mm of the objective
+TORN_PER_MM = 1e3
 #: a part of one tree is that of another whose points lie so near, mm
 SAME_MM = 1.0
 
@@ -84,18 +86,22 @@ def _with_partners(
     before: Trial | None = None
     while before is not now and not run.progress.stopped:
         before, left = now, MOST_IN_VAIN
+        enough, whole = (1 - BETTER) * now.loss, loose_mm(now.tree) + LEAST_LOOSE_MM
         for one in _doubted(now.state, now.loss, targets, run):
+            if not left:
+                break
             most = HOPELESS * now.loss
             other = run.tried(one.applied(now.tree), targets, FIRST_STEP * most)
-            if run.progress.stopped or not left:
-                break
-            if other.loss > most:
-                continue
-            left -= 1
-            other = _with_missed(other, views, targets, run, told)
-            if (1 - BETTER) * now.loss < other.loss < TORN * now.loss:
+            if other.loss <= most:
+                left -= 1
+                other = _with_missed(other, views, targets, run, told)
+            if other.loss < TORN * now.loss and (
+                other.loss > enough or loose_mm(other.tree) > whole
+            ):
                 other = _hung(other, views, targets, run, told, now.tree)
-            if other.loss < (1 - BETTER) * now.loss and not run.progress.stopped:
+            if run.progress.stopped:
+                break
+            if other.loss < enough and loose_mm(other.tree) <= whole:
                 now = other
                 break
     return now
@@ -210,6 +216,8 @@ def _hung(
     if run.progress.stopped:
         return given
     price = 0.0 if _exact(targets) else LOOSE_PER_MM
+    if known is not None:
+        price = TORN_PER_MM
     values = [one.loss + price * loose_mm(one.tree) for one in (given, other)]
     return other if values[1] < values[0] else given
 
