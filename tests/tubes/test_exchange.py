@@ -117,11 +117,13 @@ def test_what_is_right_stays_to_the_last_bit(monkeypatch):
     assert _found(start, truth, carms, True).points().tobytes() == found.points().tobytes()
 
 
-def test_estimated_paths_have_nothing_exchanged(monkeypatch):
-    """What is said of mass there is less sure than what was told of places."""
-    truth, wrong, carms = _crossing()
+@pytest.mark.parametrize(("calibrated", "size"), [(False, 256), (True, 64)])
+def test_what_says_little_of_mass_has_nothing_exchanged(monkeypatch, calibrated, size):
+    """Estimated paths, and pixels of 1.4 mm at the isocentre."""
+    truth, wrong, _ = _crossing()
     monkeypatch.setattr(topology, "exchanges", lambda *_: pytest.fail("asked for"))
-    assert len(_found(points_of(wrong, grid(100)), truth, carms, False).branches) > 0
+    start, carms = points_of(wrong, grid(100)), two_views(size, 128 / size)
+    assert len(_found(start, truth, carms, calibrated).branches) > 0
 
 
 def test_lines_are_followed_through_common_planes():
