@@ -19,6 +19,7 @@ from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import Progress
 from gcar_deploy.tubes.run import Run
 from gcar_deploy.tubes.targets import make_targets
+from gcar_deploy.tubes.topology import loose_mm
 from tests.tree.shapes import grid, points_of
 from tests.tubes.scenes import seen, two_views
 
@@ -115,6 +116,21 @@ def test_what_is_right_stays_to_the_last_bit(monkeypatch):
     for name, value in (("DOUBTED", 0.0), ("UNEXPLAINED", 0.0), ("HOPELESS", np.inf)):
         monkeypatch.setattr(topology, name, value)
     assert _found(start, truth, carms, True).points().tobytes() == found.points().tobytes()
+
+
+def test_an_exchange_that_tears_the_tree_apart_is_none(monkeypatch):
+    """Two twigs hang on the end of a stretch that would go elsewhere."""
+    truth, wrong, carms = _crossing()
+    ends = np.stack([branch.points_mm[-1] for branch in wrong.branches])
+    end = ends[cKDTree(truth.points()).query(ends)[0].argmax()]
+    for way in ([0.0, 0.6, -0.8], [0.0, 0.6, 0.8]):
+        twig = end + np.linspace(0.0, 12.0, 13)[:, None] * np.array(way)
+        truth, wrong = (with_branch(tree, twig, 0.9, 1.0, 0.5) for tree in (truth, wrong))
+    monkeypatch.setattr(topology, "_hung", lambda given, *_: given)
+    start = points_of(wrong, grid(100))
+    assert loose_mm(_found(start, truth, carms, True)) < 1.0
+    monkeypatch.setattr(topology, "LEAST_LOOSE_MM", np.inf)
+    assert loose_mm(_found(start, truth, carms, True)) > 10.0
 
 
 @pytest.mark.parametrize(("calibrated", "size"), [(False, 256), (True, 64)])
