@@ -170,7 +170,8 @@ def _past_spurs(tree: Tree) -> list[tuple[tuple[int, ...], Branch]]:
     """Vessels that spurs part into several branches, each with the numbers of those."""
     free = tree.degrees == 1
     spur = np.array(
-        [one.length_mm < SPUR_MM and (free[one.start] or free[one.end]) for one in tree.branches]
+        [one.length_mm < SPUR_MM and (free[one.start] or free[one.end]) for one in tree.branches],
+        dtype=bool,
     )
     out = []
     for vessel in kept_branches(tree, ~spur).branches:

@@ -8,7 +8,7 @@ from gcar_deploy.predict import Evidence
 from gcar_deploy.quality.alternatives import evidence_elsewhere, exchanges, findings, turning_points
 from gcar_deploy.quality.shown import Shown
 from gcar_deploy.tree.edit import with_branch
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.hard.phantoms import PAIR, bars, carm, seven, straight
 from tests.tree.shapes import branch
 
@@ -26,6 +26,7 @@ def test_parallel_bars_of_one_width_can_be_exchanged():
 def test_a_third_view_a_single_vessel_and_a_tree_leave_nothing_open():
     assert exchanges(bars(3), (*VIEWS, carm(0, 30))) == ()
     assert exchanges(straight(), VIEWS) == ()
+    assert exchanges(empty_tree(), VIEWS) == ()
     assert exchanges(seven(), PAIR) == ()
 
 
