@@ -9,6 +9,7 @@ the crossing each takes the line of the other, followed from one epipolar plane 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 
 import cv2
@@ -22,6 +23,7 @@ from gcar_deploy.geometry.epipolar import plane_angles, reach_mm, triangulate
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.tree.edit import NEW_STEP_MM, merged, reversed_branch
 from gcar_deploy.tree.tree import Branch, Tree, along, polyline_arc
+from gcar_deploy.tubes.gauss_newton import data_term
 from gcar_deploy.tubes.model import Footprint
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Array, Pixels, Points, Scalars
@@ -40,66 +42,69 @@ SMOOTH_STEPS = 2.0
 BESIDE_MM = 1.5
 
 
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """A branch from one of its points on.
+
+    Attributes
+    ----------
+    branch : its number
+    at : the point at which the stretch begins
+    forward : whether it runs on to the branch's end, or back to its start
+    """
+
+    branch: int
+    at: int
+    forward: bool
+
+    def line(self, tree: Tree) -> Points:
+        """(n, 3) points along it."""
+        points = tree.branches[self.branch].points_mm
+        return points[self.at :] if self.forward else points[self.at :: -1]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Exchange:
     """Two branches that may change partners beyond a crossing.
 
     Attributes
     ----------
-    branches : their numbers
-    forward : whether the stretch runs on to the branch's end, or back to its start
-    at : the point of each branch at which it begins
-    courses_mm : (m, 3) the new stretch of each, from the crossing
+    stretches : of both beyond the crossing
+    courses_mm : (m, 3) where each would run instead, from the crossing
     """
 
-    branches: tuple[int, int]
-    forward: tuple[bool, bool]
-    at: tuple[int, int]
+    stretches: tuple[Stretch, Stretch]
     courses_mm: tuple[Points, Points]
-
-    def stretches(self, tree: Tree) -> list[Points]:
-        """Return what ``tree`` holds of both stretches, (n, 3) each, from the crossing."""
-        return [
-            _stretch(tree.branches[number], at, forward)
-            for number, at, forward in zip(self.branches, self.at, self.forward, strict=True)
-        ]
 
     def applied(self, tree: Tree) -> Tree:
         """Return the tree with both exchanged; what hung on their far ends hangs on nothing."""
         nodes, branches = list(tree.nodes_mm), list(tree.branches)
-        for number, at, forward, course in zip(
-            self.branches, self.at, self.forward, self.courses_mm, strict=True
-        ):
-            branch = branches[number] if forward else reversed_branch(branches[number])
-            first = at if forward else len(branch) - 1 - at
+        for own, course in zip(self.stretches, self.courses_mm, strict=True):
+            branch = branches[own.branch]
+            first = own.at
+            if not own.forward:
+                branch, first = reversed_branch(branch), len(branch) - 1 - first
             line = np.concatenate([branch.points_mm[: first + 1], course[1:]])
-            branches[number] = _redrawn(branch, resample(line, NEW_STEP_MM), len(nodes))
-            nodes.append(branches[number].points_mm[-1])
+            branches[own.branch] = _redrawn(branch, resample(line, NEW_STEP_MM), len(nodes))
+            nodes.append(branches[own.branch].points_mm[-1])
         return merged(Tree(nodes_mm=np.array(nodes), branches=tuple(branches)))
 
 
 def exchanges(tree: Tree, carms: Sequence[CArm]) -> list[Exchange]:
     """Find the stretches beyond crossings in either of two views that could be exchanged."""
     out = []
-    reach = reach_mm(carms[0], carms[1])
-    for view, (one, i), (other, j) in _crossings(tree, carms):
-        for forward in ((True, True), (True, False), (False, True), (False, False)):
-            lines = [
-                _steps(_stretch(tree.branches[number], at, ahead))
-                for number, at, ahead in zip((one, other), (i, j), forward, strict=True)
-            ]
-            if min(len(line) for line in lines) * STEP_MM < LEAST_MM:
-                continue
-            pixels = [[carm.project(line)[0] for carm in carms] for line in lines]
-            planes = [
-                reach * plane_angles(carms[0], carms[1], carms[0], both[0]) for both in pixels
-            ]
-            pairs = followed(*planes)
+    for view, *places in _crossings(tree, carms):
+        ways = [_ways(tree, carms, *place) for place in places]
+        for one, other in itertools.product(*ways):
+            pairs = followed(one.planes_mm, other.planes_mm)
             if pairs[-1].min() * STEP_MM < LEAST_MM:
                 continue
-            first = _course(carms, view, (pixels[0], pairs[:, 0]), (pixels[1], pairs[:, 1]))
-            second = _course(carms, view, (pixels[1], pairs[:, 1]), (pixels[0], pairs[:, 0]))
-            out.append(Exchange((one, other), forward, (i, j), (first, second)))
+            here, there = ([way.pixels[k][at] for k in (0, 1)]
+                           for way, at in zip((one, other), pairs.T, strict=True))  # fmt: skip
+            # In the view of the crossing each takes the other's line.
+            here[view], there[view] = there[view], here[view]
+            courses = _course(carms, here), _course(carms, there)
+            out.append(Exchange((one.stretch, other.stretch), courses))
     return out
 
 
@@ -146,7 +151,7 @@ def costs(
     out = []
     for target, seen in zip(targets, prints, strict=True):
         model = target.contrast * seen.image(target.path_mm.shape)
-        scale = 0.5 * options.robust_sigmas**2 * target.weight * target.pixel_mm**2
+        scale = data_term(target, 1.0, options) * target.weight
         sigma = options.robust_sigmas * target.sigma_mm
         left, empty = (path / sigma for path in (target.path_mm - model, target.path_mm))
         out.append((scale * np.log1p(left * left), scale * np.log1p(empty * empty)))
@@ -192,24 +197,32 @@ def _crossings(
                 yield view, (int(one), int(a - start[one])), (int(other), int(b - start[other]))
 
 
-def _stretch(branch: Branch, at: int, forward: bool) -> Points:
-    return branch.points_mm[at:] if forward else branch.points_mm[at::-1]
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Way:
+    """A stretch, its (n, 2) pixels in both views in steps, and the (n,) planes of those, mm."""
+
+    stretch: Stretch
+    pixels: list[Pixels]
+    planes_mm: Scalars
 
 
-def _steps(line: Points) -> Points:
-    arc = polyline_arc(line)
-    return along(line, arc, np.arange(0.0, arc[-1], STEP_MM))
+def _ways(tree: Tree, carms: Sequence[CArm], branch: int, at: int) -> list[_Way]:
+    """Both ways along a branch, as far as they are long enough."""
+    out = []
+    for forward in (True, False):
+        stretch = Stretch(branch, at, forward)
+        line = stretch.line(tree)
+        arc = polyline_arc(line)
+        steps = along(line, arc, np.arange(0.0, arc[-1], STEP_MM))
+        if len(steps) * STEP_MM >= LEAST_MM:
+            pixels = [carm.project(steps)[0] for carm in carms]
+            angle = plane_angles(carms[0], carms[1], carms[0], pixels[0])
+            out.append(_Way(stretch, pixels, angle * reach_mm(carms[0], carms[1])))
+    return out
 
 
-def _course(
-    carms: Sequence[CArm],
-    view: int,
-    own: tuple[list[Pixels], Array],
-    of: tuple[list[Pixels], Array],
-) -> Points:
-    """(k, 3) where the line of ``of`` in ``view`` meets the own one in the other view."""
-    pixels = [own[0][k][own[1]] for k in (0, 1)]
-    pixels[view] = of[0][view][of[1]]
+def _course(carms: Sequence[CArm], pixels: Sequence[Pixels]) -> Points:
+    """(k, 3) smooth line through the places that (k, 2) pixels of both views show."""
     points, _ = triangulate(carms, pixels)
     course: Points = gaussian_filter1d(points, SMOOTH_STEPS, axis=0, mode="nearest")
     return course

@@ -180,16 +180,16 @@ def objective(
         z2 = ((path - target.contrast * seen.totals()) / sigma) ** 2
         change = np.log1p(z2 / c2) - np.log1p((path / sigma) ** 2 / c2)
         cost = target.empty_cost + float((change * target.weight.reshape(-1)[pixel]).sum())
-        total += _data_term(target, cost, options)
+        total += data_term(target, cost, options)
     return total
 
 
 def empty_objective(targets: list[Target], options: TubeOptions) -> float:
     """Return the objective of a model without tubes."""
-    return sum(_data_term(target, target.empty_cost, options) for target in targets)
+    return sum(data_term(target, target.empty_cost, options) for target in targets)
 
 
-def _data_term(target: Target, cost: float, options: TubeOptions) -> float:
+def data_term(target: Target, cost: float, options: TubeOptions) -> float:
     """Return what a picture adds to the objective; ``cost`` as ``Target.empty_cost``."""
     return 0.5 * options.robust_sigmas**2 * cost * target.pixel_mm**2
 

@@ -329,8 +329,8 @@ MUTANTS = (
     Mutant(
         "tubes: vessels exchanged in the view that they do not cross in",
         "gcar_deploy/tubes/exchange.py",
-        "pixels[view] = of[0][view][of[1]]",
-        "pixels[1 - view] = of[0][1 - view][of[1]]",
+        "here[view], there[view] = there[view], here[view]",
+        "here[1 - view], there[1 - view] = there[1 - view], here[1 - view]",
         ("tests/tubes/test_exchange.py",),
     ),
 )  # fmt: skip

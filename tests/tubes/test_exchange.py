@@ -73,7 +73,7 @@ def test_the_stretches_beyond_a_crossing_are_those_of_the_true_vessels(turned):
         1.0,
         1.0,
     ]
-    ends = [line[-1] for line in best.stretches(wrong)]
+    ends = [stretch.line(wrong)[-1] for stretch in best.stretches]
     assert away.query(ends)[0].min() > 4.0
 
 
