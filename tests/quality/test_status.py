@@ -7,10 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gcar_deploy.config import ImagingOptions, QualityOptions
+from gcar_deploy.config import ImagingOptions, QualityOptions, RunOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.extract import extract_vessels
-from gcar_deploy.quality.status import assess, check_explained, part_lengths_mm, view_quality
+from gcar_deploy.quality.status import (
+    assess,
+    check_explained,
+    judge,
+    part_lengths_mm,
+    view_quality,
+)
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.hard.phantoms import both, paths, straight
@@ -57,6 +63,13 @@ def test_a_tree_somewhere_else_is_refused(case):
     )
     with pytest.raises(RefusedError, match="only"):
         assess(away, views, [v.mask for v in views], [], None, OPTIONS)
+
+
+def test_no_tree_at_all_is_refused_with_its_reason(case):
+    """By the whole judgement: nothing that is asked of a tree may fail for want of one."""
+    _, views, _ = case
+    with pytest.raises(RefusedError, match="only 0% of the vessels"):
+        judge(empty_tree(), views, [], RunOptions(), disagreement=0.0, evidence=None)
 
 
 def test_undefined_figures_are_none(case):
