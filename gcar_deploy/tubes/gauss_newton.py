@@ -149,7 +149,7 @@ def footprints(
     """Project the tubes into every target; ``before`` is an earlier result, for its pairs."""
     pairings = [None] * len(targets) if before is None else [seen.pairing for seen in before]
     return [
-        footprint(tubes, target.carm, target.box_px, pairing)
+        footprint(tubes, target.carm, target.box_px, pairing, target.shown)
         for target, pairing in zip(targets, pairings, strict=True)
     ]
 

@@ -8,11 +8,15 @@ width b across the axis this has a closed form with bounded derivatives,
 
 A pixel's box and any blur of the picture enter through b with the same variance (b^2 / 12).
 Where tubes overlap in space, a ray's intervals through them are united, not added.
+
+A mask tells no paths: its width tells the chord of a round section, however slanted the tube, and
+of tubes behind one another it shows the widest.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -23,6 +27,9 @@ from gcar_deploy.types import Array, Points, Scalars
 
 #: a tube seen this much end-on is treated as if at this sine of the angle to the ray.
 MIN_SINE = 0.2
+#: what a picture tells of tubes, in mm: the path of each ray through them all, or the chord that
+#: the width of the widest tells
+Shown: TypeAlias = Literal["path", "width"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -138,7 +145,13 @@ class Footprint:
         return image.reshape(shape)
 
 
-def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None = None) -> Footprint:
+def footprint(
+    tubes: Tubes,
+    carm: CArm,
+    box_px: float,
+    pairing: Pairing | None = None,
+    shown: Shown = "path",
+) -> Footprint:
     """Project tubes into one view.
 
     Parameters
@@ -150,6 +163,7 @@ def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None =
         Width of the averaging box across a vessel, pixels, above 0.
     pairing : Pairing or None
         From an earlier call; used where the tubes have moved little since.
+    shown : what the picture tells of tubes
     """
     pixels, depth = carm.project(tubes.points_mm)
     per_mm = carm.px_per_mm(depth)
@@ -178,10 +192,17 @@ def footprint(tubes: Tubes, carm: CArm, box_px: float, pairing: Pairing | None =
     distance = np.sqrt(x * x + y * y)
     radius = np.exp(log_radius) * scale
     length, d_distance, d_radius = box_chord(distance, radius, box_px)
-    to_mm = np.where((t <= low) | (t >= high), 1.0, stretch) / scale
-    path = length * to_mm
-    crossings = np.bincount(pairing.group, path > 0, minlength=len(pairing.covered))
-    factor = _union_factor(pairing, middle, path)
+    if shown == "path":
+        to_mm = np.where((t <= low) | (t >= high), 1.0, stretch) / scale
+        path = length * to_mm
+        factor = _union_factor(pairing, middle, path)
+        crossing = path > 0
+    else:
+        to_mm = 1.0 / scale
+        path = length * to_mm
+        factor = _widest(pairing, path)
+        crossing = (path > 0) & (factor > 0)
+    crossings = np.bincount(pairing.group, crossing, minlength=len(pairing.covered))
     path *= factor
     to_mm *= factor
     # The distance shrinks when the axis moves towards the pixel.
@@ -248,6 +269,20 @@ def _union_factor(pairing: Pairing, middle: Scalars, path: Scalars) -> Scalars:
     more = pairing.several
     if len(more):
         factor[more] = _union_share(pairing.several_group, middle[more], path[more])
+    return factor
+
+
+def _widest(pairing: Pairing, path: Scalars) -> Scalars:
+    """Per entry: 1 for the longest of its pixel, the first of ties, 0 for what that hides."""
+    factor = np.ones(len(path))
+    a, b = pairing.double
+    hidden = path[b] > path[a]
+    factor[a], factor[b] = ~hidden, hidden
+    more = pairing.several
+    group = pairing.several_group
+    order = np.lexsort((-path[more], group))
+    factor[more] = 0.0
+    factor[more[order[np.flatnonzero(np.diff(group[order], prepend=-1))]]] = 1.0
     return factor
 
 

@@ -12,6 +12,7 @@ from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import coarsened
+from gcar_deploy.tubes.model import Shown
 from gcar_deploy.types import Array, Scalars
 
 #: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
@@ -36,6 +37,7 @@ class Target:
     contrast : float, factor on the model, 1 for calibrated pictures
     empty_cost : float, sum over pixels of weight log(1 + (path / (c sigma))^2), the robust
         cost of an empty model
+    shown : what the picture tells of tubes, and so what the model is
     """
 
     carm: CArm
@@ -47,6 +49,7 @@ class Target:
     path_error: float = 0.0
     contrast: float = 1.0
     empty_cost: float = 0.0
+    shown: Shown = "path"
 
     @property
     def calibrated(self) -> bool:
@@ -118,6 +121,8 @@ def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:
         pixel_mm=carm.pixel_at_isocenter_mm,
         path_error=view.path_error,
         empty_cost=float((np.log1p(z * z) * weight[some]).sum()),
+        # Candidates still have to share a path, so that those that are none are told by it.
+        shown="width" if view.kind == "mask" and not level_mm else "path",
     )
 
 

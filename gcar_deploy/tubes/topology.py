@@ -3,13 +3,14 @@
 Two views leave open which line of one is which of the other: a wrong choice explains both pictures
 nearly as well, but its vessel then seldom meets the tree that it leaves in both. So parts of the
 tree that hang on nothing are given up on trial, and their lines proposed anew, each from the tree.
-Where the paths are true mm, vessels that cross in a picture also change partners on trial.
+Where the paths or the widths are true mm, vessels that cross in a picture also change partners on
+trial.
 """
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,6 +21,7 @@ from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.exchange import Exchange, cost_beside, costs, exchanges
 from gcar_deploy.tubes.gauss_newton import empty_objective, rescaled
 from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
+from gcar_deploy.tubes.model import Shown
 from gcar_deploy.tubes.proposal import Told, proposal
 from gcar_deploy.tubes.run import Run, State, Trial, coarsest_pixel_mm
 from gcar_deploy.tubes.targets import Target
@@ -36,8 +38,11 @@ LEAST_LOOSE_MM, LOOSE_PER_MM = 8.0, 0.2
 #: on generated pairs of two seeds nothing won by it that explained more than a third
 MOST_GIVEN_UP = 0.5
 #: vessels change partners that make up this share of the objective, and of whose path so much is
-#: unexplained; kept is what lowers the objective by so much
-DOUBTED, UNEXPLAINED, BETTER = 0.09, 0.035, 0.03
+#: unexplained: in true paths, and in masks, whose edges leave more; kept is what lowers the
+#: objective by so much
+DOUBTED: Mapping[Shown, float] = {"path": 0.09, "width": 0.16}
+UNEXPLAINED: Mapping[Shown, float] = {"path": 0.035, "width": 0.05}
+BETTER = 0.03
 #: a trial whose objective is so many times as large at once is given up, and what it tore off is
 #: not proposed anew where it is still so many times as large with the lines that no tube explained;
 #: so many others in vain are the last. Nearly all that won on generated pairs are within all three
@@ -108,7 +113,10 @@ def _with_partners(
 
 def _doubted(now: State, loss: float, targets: list[Target], run: Run) -> list[Exchange]:
     """Return the exchanges that stand to gain, those of the worst explained stretches first."""
-    if len(targets) != 2 or not _exact(targets) or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
+    if len(targets) != 2 or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
+        return []
+    by: Shown = "path" if _exact(targets) else "width"
+    if not all(target.calibrated or target.shown == "width" for target in targets):
         return []
     found = exchanges(now.tree, [target.carm for target in targets])
     if not found:
@@ -116,7 +124,7 @@ def _doubted(now: State, loss: float, targets: list[Target], run: Run) -> list[E
     pictures, asked = costs(targets, now.prints, run.options), []
     for one in found:
         left, empty = cost_beside([k.line(now.tree) for k in one.stretches], targets, pictures)
-        if left > max(DOUBTED * loss, UNEXPLAINED * empty):
+        if left > max(DOUBTED[by] * loss, UNEXPLAINED[by] * empty):
             asked.append((left, one))
     return [one for _, one in sorted(asked, key=lambda pair: -pair[0])]
 
