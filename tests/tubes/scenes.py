@@ -1,9 +1,13 @@
 """Made trees seen in two views, as the refiners take them."""
 
+import dataclasses
+
 import numpy as np
+from skimage.morphology import skeletonize
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.mask_path import mask_path
 from tests.tubes.oracle import path_lengths
 
 
@@ -37,4 +41,18 @@ def seen(tree, carms, calibrated=True, gain=1.0):
     return [
         vessel_image(view, gain * path_lengths(tree, view), calibrated, str(k + 1))
         for k, view in enumerate(carms)
+    ]
+
+
+def seen_as_masks(tree, carms):
+    """Masks of the same pictures, with the chords that their widths tell."""
+    return [
+        dataclasses.replace(
+            view,
+            path_mm=mask_path(view.mask, view.carm.pixel_at_isocenter_mm),
+            path_error=0.3,
+            skeleton=skeletonize(view.mask),
+            kind="mask",
+        )
+        for view in seen(tree, carms)
     ]

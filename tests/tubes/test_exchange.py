@@ -21,7 +21,7 @@ from gcar_deploy.tubes.run import Run
 from gcar_deploy.tubes.targets import make_targets
 from gcar_deploy.tubes.topology import loose_mm
 from tests.tree.shapes import grid, points_of
-from tests.tubes.scenes import seen, two_views
+from tests.tubes.scenes import seen, seen_as_masks, two_views
 
 
 def _crossing(start_mm=-20.0, end_mm=20.0):
@@ -87,6 +87,8 @@ def test_vessels_without_a_crossing_have_nothing_to_exchange():
 
 
 def _found(start, truth, carms, calibrated):
+    if calibrated == "mask":
+        return fit_tubes(start, seen_as_masks(truth, carms), TubeOptions(), evidence=start).tree
     views = [
         dataclasses.replace(view, skeleton=skeletonize(view.mask))
         for view in seen(truth, carms, calibrated=calibrated)
@@ -94,14 +96,15 @@ def _found(start, truth, carms, calibrated):
     return fit_tubes(start, views, TubeOptions(), evidence=start).tree
 
 
-def test_wrong_partners_are_exchanged_where_paths_are_true(monkeypatch):
+@pytest.mark.parametrize("calibrated", [True, "mask"])
+def test_wrong_partners_are_exchanged_where_paths_or_widths_are_true(monkeypatch, calibrated):
     truth, wrong, carms = _crossing()
     start = points_of(wrong, grid(100))
-    found = _found(start, truth, carms, True)
+    found = _found(start, truth, carms, calibrated)
     assert cKDTree(truth.points()).query(found.points())[0].max() < 1.0
     assert cKDTree(found.points()).query(truth.points())[0].max() < 1.5
     monkeypatch.setattr(topology, "MOST_IN_VAIN", 0)
-    left = _found(start, truth, carms, True)
+    left = _found(start, truth, carms, calibrated)
     assert cKDTree(truth.points()).query(left.points())[0].max() > 4.0
 
 
@@ -113,8 +116,9 @@ def test_what_is_right_stays_to_the_last_bit(monkeypatch):
     assert _found(start, truth, carms, True).points().tobytes() == found.points().tobytes()
     monkeypatch.undo()
     # Though every exchange is tried, none is better.
-    for name, value in (("DOUBTED", 0.0), ("UNEXPLAINED", 0.0), ("HOPELESS", np.inf)):
-        monkeypatch.setattr(topology, name, value)
+    for name in ("DOUBTED", "UNEXPLAINED"):
+        monkeypatch.setattr(topology, name, {"path": 0.0, "width": 0.0})
+    monkeypatch.setattr(topology, "HOPELESS", np.inf)
     assert _found(start, truth, carms, True).points().tobytes() == found.points().tobytes()
 
 

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.config import RefineOptions, TubeOptions
 from gcar_deploy.gaussians.centers import CenterPoints
+from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.stopwatch import Budget
 from gcar_deploy.tree.occupancy import tree_occupancy
 from gcar_deploy.tree.tree import Tree
@@ -25,7 +26,7 @@ from gcar_deploy.tubes.refine import refine, refined_volume
 from gcar_deploy.tubes.settle import scatter_is_none, settled
 from gcar_deploy.tubes.targets import make_targets
 from tests.tree.shapes import branch, dice, fork, grid, points_of
-from tests.tubes.scenes import seen, two_views, vessel_image
+from tests.tubes.scenes import seen, seen_as_masks, two_views, vessel_image
 
 OPTIONS = TubeOptions()
 
@@ -35,9 +36,10 @@ def prior_of(tubes):
 
 
 @pytest.mark.req("REQ-43")
-def test_gradient_matches_differences():
+@pytest.mark.parametrize(("of", "level"), [(seen, 1.0), (seen_as_masks, 0.0)])
+def test_gradient_matches_differences(of, level):
     truth = fork()
-    targets = make_targets(seen(truth, two_views(128, 1.0)), 1.0, OPTIONS)
+    targets = make_targets(of(truth, two_views(128, 1.0)), level, OPTIONS)
     tubes = tubes_of(truth)
     rng = np.random.default_rng(0)
     tubes = dataclasses.replace(
@@ -63,6 +65,22 @@ def test_gradient_matches_differences():
         down = dataclasses.replace(tubes, log_radius=tubes.log_radius - step)
         errors.append((value(up) - value(down)) / (2 * h) - gradient[k])
     assert np.abs(errors).max() < 0.05 * np.abs(gradient[split:]).max()
+
+
+def test_vessels_behind_one_another_keep_their_width_in_masks():
+    """Alone in the second view, on one line in the first, whose mask shows one of two."""
+    carms = two_views()
+    ray = -carms[0].source_mm / np.linalg.norm(carms[0].source_mm)
+    across = plane_normal(*carms)
+    lines = [np.arange(-20.0, 21.0)[:, None] * across + at * ray for at in (-7.0, 7.0)]
+    truth = Tree(
+        nodes_mm=np.concatenate([line[[0, -1]] for line in lines]),
+        branches=(branch(lines[0], 1.2), branch(lines[1], 1.2, 2, 3)),
+    )
+    fitted = fit_tubes(points_of(truth, grid(100)), seen_as_masks(truth, carms), OPTIONS).tree
+    assert len(fitted.branches) == 2
+    for own in fitted.branches:
+        assert np.median(own.radius_mm) == pytest.approx(1.2, rel=0.08)
 
 
 def test_no_tube_costs_what_every_pixel_costs():

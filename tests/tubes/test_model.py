@@ -61,6 +61,49 @@ def test_tubes_at_different_depth_add_up():
     assert picture.max() == pytest.approx(6.0, abs=0.1)
 
 
+@pytest.mark.parametrize("slant_deg", [0.0, 30.0, 55.0])
+def test_a_width_says_nothing_of_how_slanted_a_tube_is(slant_deg):
+    view = carm(0, 0)
+    ray = -view.source_mm / np.linalg.norm(view.source_mm)
+    axis = (
+        np.cos(np.radians(slant_deg)) * np.array([0, 0, 1.0]) + np.sin(np.radians(slant_deg)) * ray
+    )
+    line = np.linspace(-15, 15, 31)[:, None] * axis
+    tubes = tubes_of(Tree(nodes_mm=line[[0, -1]], branches=(branch(line, 1.5),)))
+    middle = np.s_[126:130]
+    width = footprint(tubes, view, 0.1, shown="width").image((256, 256))[middle].max()
+    path = footprint(tubes, view, 0.1).image((256, 256))[middle].max()
+    assert width == pytest.approx(3.0, rel=0.02)
+    assert path == pytest.approx(3.0 / np.cos(np.radians(slant_deg)), rel=0.02)
+
+
+@pytest.mark.parametrize("radii", [(1.5, 0.8), (1.2, 1.2), (0.7, 1.5, 1.0), (0.5, 0.9, 1.3, 1.7)])
+def test_of_tubes_behind_one_another_the_widest_shows(radii):
+    view, nodes, branches = carm(0, 0), [], []
+    for k, radius in enumerate(radii):
+        turn = 0.3 * k
+        along = np.linspace(-15, 15, 31)[:, None] * [np.cos(turn), 0.0, np.sin(turn)]
+        line = along + np.array([0.0, 12.0 * k, 0.0])
+        nodes += [line[0], line[-1]]
+        branches.append(branch(line, radius, 2 * k, 2 * k + 1))
+    alone = [
+        footprint(
+            tubes_of(
+                Tree(nodes_mm=one.points_mm[[0, -1]], branches=(branch(one.points_mm, radius),))
+            ),
+            view, 1.0, shown="width",
+        ).image((256, 256))
+        for one, radius in zip(branches, radii, strict=True)
+    ]  # fmt: skip
+    tree = Tree(nodes_mm=np.array(nodes), branches=tuple(branches))
+    both = footprint(tubes_of(tree), view, 1.0, shown="width")
+    np.testing.assert_allclose(both.image((256, 256)), np.max(alone, axis=0), atol=1e-9)
+    # What is hidden pulls at nothing, and a pixel that shows one tube is one equation for it.
+    assert both.crossings.max() == 1
+    hidden = both.path_mm == 0
+    assert not both.d_axis[:, hidden].any() and not both.d_log_radius[hidden].any()
+
+
 def test_pairs_kept_from_before_give_the_same_picture():
     tubes, view = tubes_of(fork()), carm(30, 20)
     first = footprint(tubes, view, 1.0)

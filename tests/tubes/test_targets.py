@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gcar_deploy.tubes.targets import CONTRAST_SIGMAS, Target
-from tests.tubes.scenes import carm
+from gcar_deploy.config import TubeOptions
+from gcar_deploy.tubes.targets import CONTRAST_SIGMAS, Target, make_targets
+from tests.tree.shapes import fork
+from tests.tubes.scenes import carm, seen, seen_as_masks, two_views
 
 CARM, COVERED = carm(30, 20, size=16), np.array([5, 9])
 
@@ -34,3 +36,12 @@ def test_contrast_is_held_to_what_its_error_allows_and_is_one_where_it_is_known(
     kept = dataclasses.replace(_target(path_error=0.0), contrast=1.0)
     assert kept.with_contrast(COVERED, thin) is kept
     assert _target().with_contrast(COVERED[:0], thin[:0]).contrast == 1.0
+
+
+def test_only_the_own_pixels_of_masks_show_widths():
+    views = [seen(fork(), two_views())[0], seen_as_masks(fork(), two_views())[1]]
+    shown = [
+        [target.shown for target in make_targets(views, level, TubeOptions())]
+        for level in (1.0, 0.0)
+    ]
+    assert shown == [["path", "path"], ["path", "width"]]
