@@ -67,20 +67,29 @@ def test_gradient_matches_differences(of, level):
     assert np.abs(errors).max() < 0.05 * np.abs(gradient[split:]).max()
 
 
-def test_vessels_behind_one_another_keep_their_width_in_masks():
-    """Alone in the second view, on one line in the first, whose mask shows one of two."""
+def test_true_vessels_behind_one_another_explain_their_masks():
+    """Two on one line in the first view, slanted to its rays, and one aside."""
     carms = two_views()
     ray = -carms[0].source_mm / np.linalg.norm(carms[0].source_mm)
     across = plane_normal(*carms)
-    lines = [np.arange(-20.0, 21.0)[:, None] * across + at * ray for at in (-7.0, 7.0)]
+    along = np.arange(-20.0, 21.0)[:, None] * (across + 0.7 * ray)
+    lines = [along + at for at in (-7.0 * ray, 7.0 * ray, 14.0 * np.cross(ray, across))]
     truth = Tree(
         nodes_mm=np.concatenate([line[[0, -1]] for line in lines]),
-        branches=(branch(lines[0], 1.2), branch(lines[1], 1.2, 2, 3)),
+        branches=tuple(branch(line, 1.2, 2 * k, 2 * k + 1) for k, line in enumerate(lines)),
     )
-    fitted = fit_tubes(points_of(truth, grid(100)), seen_as_masks(truth, carms), OPTIONS).tree
-    assert len(fitted.branches) == 2
-    for own in fitted.branches:
-        assert np.median(own.radius_mm) == pytest.approx(1.2, rel=0.08)
+    tubes = tubes_of(truth)
+    cost = {}
+    for shown in ("width", "path"):
+        targets = [
+            dataclasses.replace(target, shown=shown)
+            for target in make_targets(seen_as_masks(truth, carms), 0.0, OPTIONS)
+        ]
+        prints = footprints(tubes, targets)
+        value = objective(tubes, targets, prints, prior_of(tubes), OPTIONS)
+        cost[shown] = value / empty_objective(targets, OPTIONS)
+    assert cost["width"] < 0.1
+    assert cost["width"] < 0.4 * cost["path"]
 
 
 def test_no_tube_costs_what_every_pixel_costs():
