@@ -114,7 +114,9 @@ def misfit(tubes: Tubes, target: Target, seen: Footprint, left: Scalars) -> Scal
     most = np.full(len(seen.covered), LEAST_MISFIT)
     np.maximum.at(most, seen.group, local)
     local = most[seen.group]
-    out: Scalars = PATCH_MM2 * local * np.where(seen.crossings > 1, CROSSED, 1.0)
+    # A mask shows one of several, and which one is open all the same.
+    there = seen.crossings if target.shown == "path" else np.bincount(seen.group)[seen.group]
+    out: Scalars = PATCH_MM2 * local * np.where(there > 1, CROSSED, 1.0)
     return out
 
 

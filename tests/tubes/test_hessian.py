@@ -151,3 +151,17 @@ def test_misfit_is_local_and_as_large_as_what_is_left_over():
     # Who is to blame where both are: the worse of them, and the crossing.
     both = found[(print_.crossings > 1) & (print_.path_mm > 0)]
     assert len(both) and (both >= CROSSED * PATCH_MM2 * (z2.min() + LEAST_MISFIT)).all()
+
+
+def test_what_a_mask_hides_leaves_open_which_tube_it_shows():
+    tubes = tubes_of(crossed())
+    target = dataclasses.replace(
+        make_targets(seen(crossed(), [carm(0, 0, 96, 1.3)]), 0.0, OPTIONS)[0], shown="width"
+    )
+    (print_,) = footprints(tubes, [target])
+    told = misfit(tubes, target, print_, np.zeros(len(print_.pixel)))
+    both = np.bincount(print_.pixel)[print_.pixel] > 1
+    assert both.any() and not both.all()
+    assert print_.crossings[both].max() == 1
+    assert told[both] == pytest.approx(FLOOR * CROSSED)
+    assert told[~both] == pytest.approx(FLOOR)
