@@ -55,7 +55,7 @@ class TubeFit:
     scatter_mm : float, estimated scatter of the starting points (0 on a lattice)
     contrast : tuple of float, per view, factor of the picture's path on the model's
     progress : Progress
-    model_mm : per view (rows, cols) path of the tubes at the picture's own pixels; empty where
+    model_mm : per view (rows, cols) what the picture's own pixels tell of the tubes; empty where
         the fit ended before that level
     close_calls : pieces that were kept or dropped by a hair
     """

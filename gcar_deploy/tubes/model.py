@@ -99,7 +99,7 @@ class Footprint:
     Attributes
     ----------
     t : (e,) 0 .. 1, where along the segment
-    path_mm : (e,) contribution, the union factor included
+    path_mm : (e,) contribution, the union factor included; 0 of what a mask hides
     d_axis : (2, e) derivative by the place of the axis, (col, row), mm per px
     d_log_radius : (e,) derivative by log radius, mm
     crossings : (e,) number of entries above 0 that share the pixel
@@ -192,19 +192,13 @@ def footprint(
     distance = np.sqrt(x * x + y * y)
     radius = np.exp(log_radius) * scale
     length, d_distance, d_radius = box_chord(distance, radius, box_px)
-    if shown == "path":
-        to_mm = np.where((t <= low) | (t >= high), 1.0, stretch) / scale
-        path = length * to_mm
-        factor = _union_factor(pairing, middle, path)
-        crossing = path > 0
-    else:
-        to_mm = 1.0 / scale
-        path = length * to_mm
-        factor = _widest(pairing, path)
-        crossing = (path > 0) & (factor > 0)
-    crossings = np.bincount(pairing.group, crossing, minlength=len(pairing.covered))
+    unslanted = (t <= low) | (t >= high) | (shown == "width")
+    to_mm = np.where(unslanted, 1.0, stretch) / scale
+    path = length * to_mm
+    factor = _union_factor(pairing, middle, path) if shown == "path" else _widest(pairing, path)
     path *= factor
     to_mm *= factor
+    crossings = np.bincount(pairing.group, path > 0, minlength=len(pairing.covered))
     # The distance shrinks when the axis moves towards the pixel.
     towards = d_distance * to_mm / -np.maximum(distance, 1e-9)
     return Footprint(

@@ -60,7 +60,8 @@ class Refined:
         ``failed`` (not finite); ``empty`` (nothing to refine).
     contrast : (views,) factor of each picture's path on the model's, 1 where calibrated
     centers : CenterPoints the refinement started from
-    model_mm : per view (rows, cols) path of the fitted tubes, mm; empty where not at hand
+    model_mm : per view (rows, cols) what the picture tells of the fitted tubes, mm; empty where
+        not at hand
     ending : how the fit ended, None where no tubes were fitted
     close_calls : pieces of vessel that were kept or dropped by a hair
     """

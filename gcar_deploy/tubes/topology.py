@@ -113,11 +113,10 @@ def _with_partners(
 
 def _doubted(now: State, loss: float, targets: list[Target], run: Run) -> list[Exchange]:
     """Return the exchanges that stand to gain, those of the worst explained stretches first."""
-    if len(targets) != 2 or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
+    told = all(target.calibrated or target.shown == "width" for target in targets)
+    if len(targets) != 2 or not told or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
         return []
     by: Shown = "path" if _exact(targets) else "width"
-    if not all(target.calibrated or target.shown == "width" for target in targets):
-        return []
     found = exchanges(now.tree, [target.carm for target in targets])
     if not found:
         return []
