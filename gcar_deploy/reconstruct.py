@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from gcar_deploy.beside import started
 from gcar_deploy.config import RunOptions, check_options
-from gcar_deploy.errors import UsageError
+from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
@@ -21,6 +21,7 @@ from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.vessels import find_vessels
 from gcar_deploy.measure import (
     from_inlets,
+    idle_ostia,
     joined_over_lesions,
     measure_sections,
     read_signal,
@@ -138,14 +139,17 @@ def _reconstructed(
         refined = refined.with_tree(joined_over_lesions(refined.tree, signals))
         refined, missed = refined.without(options.deleted_mm)
         keep(refined)
+        if options.deleted_mm and not refined.tree.branches:
+            raise RefusedError("every branch was deleted: nothing is left")
         check_tree(refined.tree, options.quality)
     # Nothing but the result asks for the voxels: they are made beside what follows.
     made = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
     with watch.stage("quality", keep_if_late=True), placed.hinting():
         for stage in (vessels, placed, centers, refined):
             findings += stage.findings
-        findings += missed
         ostia = marked_places(options.ostia, [view.carm for view in placed.views])
+        idle = idle_ostia(refined.tree, ostia)
+        findings += missed + idle
         tree = from_inlets(refined.tree, ostia)
         judged = judge(
             tree, placed.views, findings, options,
@@ -169,21 +173,21 @@ def _reconstructed(
         losses=refined.losses, predictor=centers.points.source, refiner=refined.refiner,
         model=None if predictor is None else predictor.model.label,
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
-        notes=_marks(options, len(missed)), options=options, ending=refined.ending,
+        notes=_marks(options, len(missed), len(idle)), options=options, ending=refined.ending,
         close_calls=refined.close_calls,
     )  # fmt: skip
 
 
-def _marks(options: RunOptions, missed: int) -> tuple[str, ...]:
-    """Say what of the result goes back to marks of the user; of deletions ``missed`` did nothing.
+def _marks(options: RunOptions, missed: int, idle: int) -> tuple[str, ...]:
+    """Say what of the result goes back to marks of the user.
 
-    Lesions are said by who measures them.
+    Of deletions ``missed`` did nothing, of ostia ``idle``. Lesions are said by who measures them.
     """
     counts = {
         "branches deleted": len(options.deleted_mm) - missed,
         "landmarks that hold the views to each other": len(options.landmarks),
         "marks of one vessel in several views": len(options.same_branch),
-        "inlets of an artery": len(options.ostia),
+        "inlets of an artery": len(options.ostia) - idle,
     }
     return tuple(f"of the user: {what} ({n})" for what, n in counts.items() if n)
 

@@ -138,6 +138,8 @@ class VesselImage:
         Probability of catheter, lead or wire; None where no network was asked.
     by_network : bool
         Whether the network's word is in it.
+    painted : (rows, cols) bool or None
+        Vessel that a person drew: as wide as drawn, whatever the picture shows.
     kept : callable or None
         Gives the same with nothing taken for a device, where something was: few pairs ask. It is
         made once, however often it is asked for.
@@ -156,12 +158,13 @@ class VesselImage:
     catheter_mm: float = 0.0
     device: Image | None = None
     by_network: bool = False
+    painted: Mask | None = None
     others: tuple[VesselImage, ...] = ()
     kept: Callable[[], VesselImage] | None = None
 
     def __post_init__(self) -> None:
-        arrays = (self.path_mm, self.mask, self.skeleton, self.valid, self.catheter, self.device)
-        for array in arrays:
+        masks = (self.mask, self.skeleton, self.valid, self.catheter, self.painted)
+        for array in (self.path_mm, *masks, self.device):
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
         if self.kept is not None and not hasattr(self.kept, "cache_info"):

@@ -11,13 +11,15 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.mask_path import mask_path
 
+#: a picture of path lengths tells of vessel from so many mm on: below it shows none, or noise
+LEAST_TOLD_MM = 0.2
+
 
 def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
     """Apply the strokes of a picture to its vessels.
 
     What is erased holds no vessel: its path is 0, which the fit believes. What is painted is
-    vessel as thick as it is wide, except in pictures of path lengths, which tell the path
-    themselves.
+    vessel as thick as it is wide, except where a picture of path lengths tells the path itself.
 
     Parameters
     ----------
@@ -39,11 +41,12 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
     line, path = found.skeleton & ~erased, np.where(erased, np.float32(0), found.path_mm)
     if painted.any():
         new = painted & (path <= 0)
+        drawn = mask_path(mask, angiogram.carm.pixel_at_isocenter_mm)
         scale = angiogram.intensity.mm_per_count
         if found.kind == "path_length" and scale is not None:
-            path = np.where(new, angiogram.pixels * np.float32(scale), path)
-        else:
-            path = np.where(new, mask_path(mask, angiogram.carm.pixel_at_isocenter_mm), path)
+            told = angiogram.pixels * np.float32(scale)
+            drawn = np.where(told > LEAST_TOLD_MM, told, drawn)
+        path = np.where(new, drawn, path)
         # Lines elsewhere stay as they were found; where paint meets them they are drawn anew.
         line = np.where(painted, skel.skeletonize(mask), line)
     if not line.any():
@@ -53,6 +56,7 @@ def edited(found: VesselImage, angiogram: Angiogram) -> VesselImage:
         mask=mask,
         skeleton=line,
         path_mm=np.asarray(path, dtype=np.float32),
+        painted=painted if painted.any() else None,
         others=tuple(edited(other, angiogram) for other in found.others),
         kept=None if kept is None else lambda: edited(kept(), angiogram),
     )

@@ -39,6 +39,9 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     mask &= path > 0
     valid = area_average(old.valid.astype(np.float32), rows, columns) >= 0.5
     response, catheter, device = old.vesselness, old.catheter, old.device
+    painted = old.painted
+    if painted is not None:
+        painted = area_average(painted.astype(np.float32), rows, columns) > 0
     if catheter is not None:
         catheter = (area_average(catheter.astype(np.float32), rows, columns) >= 0.5) & ~mask
     return dataclasses.replace(
@@ -52,6 +55,7 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
         valid=valid,
         vesselness=None if response is None else area_average(response, rows, columns),
         catheter=catheter,
+        painted=painted,
         device=None if device is None else area_average(device, rows, columns),
     )
 

@@ -71,6 +71,16 @@ def inlets(tree: Tree, marked_mm: Points | None = None) -> tuple[int, ...]:
     return tuple(out)
 
 
+def idle_ostia(tree: Tree, marked_mm: Points) -> list[str]:
+    """Return a sentence (a finding) for each marked ostium near which no vessel ends."""
+    free = end_radii(tree)
+    return [
+        f"ostium {number}: no vessel ends within {MARKED_MM:g} mm of it"
+        for number, place in enumerate(marked_mm, start=1)
+        if _end_at(tree, free, place) is None
+    ]
+
+
 def _end_at(tree: Tree, free: Mapping[int, float], place_mm: Points) -> int | None:
     """Free end nearest to a place, None where none lies within ``MARKED_MM``."""
     nodes = sorted(free)

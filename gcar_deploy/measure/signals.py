@@ -64,6 +64,9 @@ def read_signal(angiogram: Angiogram, view: VesselImage) -> Signal:
     view : what was found in it, with the geometry that was used
     """
     kind, pixels = angiogram.intensity.kind, angiogram.pixels
+    if view.painted is not None:
+        # Whoever paints says that the picture does not show the vessel as it is.
+        view = dataclasses.replace(view, valid=view.valid & ~view.painted)
     if kind == "mask":
         return Signal(view.carm, above_half(pixels).astype(np.float32), view.valid, "mask")
     if kind == "path_length":

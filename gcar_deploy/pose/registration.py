@@ -18,6 +18,9 @@ from gcar_deploy.quality import check_asked, check_consistency, check_motion, ch
 #: places where vessels turn and end contradict each other from here on (root mean square), mm. Of
 #: generated pictures of two patients with this rule: 0.48 to 0.83; of one patient: 0.3
 LEAST_CONTRADICTION_MM = 0.4
+#: landmarks mark one place where their rays pass so near, mm: a click is off by a pixel or two, and
+#: the heart moves by some mm between the runs
+LANDMARKS_APART_MM = 5.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,7 +122,7 @@ def register(
         findings += check_asked(ids, one.given, turn, scale, options.quality)
     moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
     findings += check_poses(views, moves, options.quality)
-    findings += _unfinished(views, poses)
+    findings += _unfinished(views, poses) + _marked_apart(views, poses)
     after, partners = [pose.after for pose in poses], [pose.partner for pose in poses]
     refusal = ""
     try:
@@ -155,6 +158,16 @@ def _two_contradictions(poses: Sequence[Pose]) -> str:
         f"{moved:.1f} mm (root mean square) in where these turn and end; different patients, "
         "frames or angles?"
     )
+
+
+def _marked_apart(views: Sequence[VesselImage], poses: Sequence[Pose]) -> list[str]:
+    """Name views whose landmarks their correction does not bring together."""
+    return [
+        f"view {view.view_id}: rays through the landmarks still pass each other by "
+        f"{pose.landmark_after_mm:.1f} mm (root mean square): do they mark the same places?"
+        for view, pose in zip(views, poses, strict=True)
+        if (pose.landmark_after_mm or 0.0) > LANDMARKS_APART_MM
+    ]
 
 
 def _unfinished(views: Sequence[VesselImage], poses: Sequence[Pose]) -> list[str]:

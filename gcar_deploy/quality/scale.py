@@ -167,6 +167,8 @@ def _profiles(tree: Tree, view: VesselImage) -> list[_Profiles]:
     tangents = np.concatenate([np.zeros((0, 3)), *(b.tangents for b in tree.branches)])
     sine = np.linalg.norm(np.cross(ray, tangents), axis=1)
     good &= sine > _LEAST_SINE
+    if view.painted is not None:
+        good &= bilinear(view.painted.astype(np.float32), pixels) == 0
     radius_px = tree.radii() / size_mm
     found = []
     for k in range(len(tree.branches)):

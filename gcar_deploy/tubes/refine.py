@@ -111,8 +111,8 @@ class Refined:
             left = without_branch_at(tree, np.array(place), DELETED_WITHIN_MM)
             if left is None:
                 missed.append(
-                    f"deleted branch {number}: none passes within {DELETED_WITHIN_MM:g} mm of "
-                    "its place"
+                    f"deletion {number}: no branch passes within {DELETED_WITHIN_MM:g} mm of its "
+                    "place"
                 )
             tree = left or tree
         if tree is self.tree:

@@ -44,6 +44,20 @@ def test_what_is_erased_alone_holds_no_vessel(picture: Angiogram) -> None:
         )
 
 
+def test_paths_that_a_picture_tells_stay_and_where_it_shows_none_the_width_is_the_path() -> None:
+    pixels = np.zeros((SIDE, SIDE), np.float32)
+    pixels[40:48, 20:180] = 0.3  # below what is taken for vessel, above noise
+    picture = Angiogram.without_geometry(
+        "1", (pixels, 16, ""), Intensity(kind="path_length", mm_per_count=1.0), 0.5
+    )
+    bars = np.zeros((SIDE, SIDE), bool)
+    bars[40:48, 20:180] = bars[120:128, 20:180] = True
+    found = extract_vessels(dataclasses.replace(picture, painted=bars), ImagingOptions())
+    assert found.path_mm[44, 90] == pytest.approx(0.3)
+    assert found.path_mm[123:125, 90] == pytest.approx(4.0, rel=0.2)
+    assert found.painted is not None and (found.painted == bars).all()
+
+
 def test_what_is_painted_alone_is_vessel(picture: Angiogram) -> None:
     bar = np.zeros((SIDE, SIDE), bool)
     bar[60:120, 90:98] = True

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
@@ -66,8 +67,8 @@ def test_a_deleted_branch_is_gone_and_the_rest_stays(engine, order, plain):
     assert found.tree.length_mm == pytest.approx(plain.tree.length_mm - gone.length_mm, abs=1e-6)
     gap = np.linalg.norm(found.tree.points() - np.array(place), axis=1).min()
     assert gap > 3 and found.volume.sum() < plain.volume.sum() - 20
-    assert any("deleted branch 2: none passes" in text for text in found.quality.findings)
-    assert not any("deleted branch 1" in text for text in found.quality.findings)
+    assert any("deletion 2: no branch passes" in text for text in found.quality.findings)
+    assert not any("deletion 1" in text for text in found.quality.findings)
     assert found.notes == (*plain.notes, "of the user: branches deleted (1)")
 
 
@@ -82,6 +83,57 @@ def test_a_second_deletion_sees_the_tree_that_the_first_left(engine, order, plai
     places = [tuple(b.points_mm[len(b) // 2].tolist()) for b in (first, second)]
     b = again(engine, order, deleted_mm=tuple(places))
     assert b.tree.length_mm == pytest.approx(a.tree.length_mm - second.length_mm, abs=1e-6)
+
+
+def test_a_tree_of_which_all_is_deleted_is_refused_for_that(engine, order, plain):
+    middles = (branch.points_mm[len(branch) // 2] for branch in plain.tree.branches)
+    places = tuple(tuple(place.tolist()) for place in middles)
+    with pytest.raises(RefusedError, match="every branch was deleted"):
+        again(engine, order, deleted_mm=places * 2)
+
+
+def test_marks_that_contradict_the_pictures_are_findings(engine, order, plain):
+    """Points of two vessels as one landmark, an ostium where nothing begins."""
+    tree, carms = plain.tree, [view.carm for view in plain.views]
+    ends = tree.branches[-1].points_mm[-1], tree.branches[0].points_mm[0]
+    mark = tuple(
+        tuple(carm.project(end[None])[0][0].tolist()) for carm, end in zip(carms, ends, strict=True)
+    )
+    free = tree.nodes_mm[tree.degrees == 1]
+    far = max(tree.points(), key=lambda point: np.linalg.norm(free - point, axis=1).min())
+    ostium = tuple(tuple(carm.project(far[None])[0][0].tolist()) for carm in carms)
+    found = again(engine, order, landmarks=(mark,), ostia=(ostium,))
+    said = found.quality.findings
+    assert found.quality.status == "degraded" and any("the landmarks" in text for text in said)
+    assert "ostium 1: no vessel ends within 15 mm of it" in said
+    assert not any("inlets" in note for note in found.notes)
+
+
+def test_paint_is_vessel_as_wide_as_it_is_drawn(engine, order, plain):
+    """A side branch that no picture shows, 3 mm wide, drawn in both."""
+    carms = [view.carm for view in plain.views]
+    own = [carm.project(plain.tree.points())[0] for carm in carms]
+    clear, line = -1.0, np.zeros((0, 3))
+    start = plain.tree.branches[4].points_mm[len(plain.tree.branches[4]) // 2]
+    for way in np.random.default_rng(5).normal(size=(400, 3)):
+        new = start + np.arange(31)[:, None] * way / np.linalg.norm(way)
+        seen = [carm.project(new)[0] for carm in carms]
+        inside = all((p > 30).all() and (p < 480).all() for p in seen)
+        apart = min(cKDTree(o).query(p[10:])[0].min() for o, p in zip(own, seen, strict=True))
+        length = min(np.linalg.norm(p[-1] - p[0]) for p in seen)
+        if inside and length > 70 and apart > clear:
+            clear, line = apart, new
+    assert clear > 15
+    edits = {}
+    for k, carm in enumerate(carms, start=1):
+        points = tuple(map(tuple, carm.project(line)[0].tolist()))
+        width = 3.0 / carm.pixel_at_isocenter_mm
+        edits[k] = (Stroke(do="paint", points=points, width_px=width),)
+    found = again(engine, order, edits=edits)
+    gap, at = cKDTree(found.tree.points()).query(line[8:-4])
+    assert np.median(gap) < 0.5 and gap.max() < 2.0
+    assert 2 * np.median(found.tree.radii()[at]) == pytest.approx(3.0, abs=0.4)
+    assert found.quality.status == plain.quality.status
 
 
 @pytest.mark.slow
