@@ -1,11 +1,20 @@
-"""Read a whole file once, with a limit: no pipe is waited for, no device is read."""
+"""Files by name and content: read once, with a limit; no pipe is waited for, no device is read."""
 
 from __future__ import annotations
 
 import codecs
 import os
+import re
 import stat
 from pathlib import Path
+
+_DIGITS = re.compile(r"(\d+)")
+
+
+def natural_order(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key of a file by its name: frame 2 goes before frame 10."""
+    parts = _DIGITS.split(path.name)
+    return [(1, int(p), "") if k % 2 else (0, 0, p) for k, p in enumerate(parts)]
 
 
 def read_bounded(path: str | Path, max_bytes: int) -> bytes:

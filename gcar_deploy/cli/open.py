@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import secrets
 import threading
@@ -38,10 +39,10 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
     """See a case in the browser, correct it, run it again.
 
     Without an argument there is a start page: the demo in one click, or drop files. With pictures
-    or DICOM runs the case is opened; with the folder of an earlier case that one; with any other
-    result folder its report. Each case has a folder below --out (gcar-cases by default) with the
-    result and order.json, which holds every correction: gcar run --order CASE/order.json makes
-    the same files again.
+    or DICOM runs, or their folder, the case is opened; with the folder of an earlier case that one;
+    with any other result folder its report. Each case has a folder below --out (gcar-cases by
+    default) with the result and order.json, which holds every correction:
+    gcar run --order CASE/order.json makes the same files again.
 
     The server listens on 127.0.0.1 alone and answers who bears its token, a part of the address.
     Ctrl-C ends it.
@@ -79,21 +80,44 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
         queue.close()
 
 
+def _of_folder(order: Order, folder: Path) -> Order:
+    """Return the order of the pictures in a folder, in the order of the numbers in their names."""
+    from gcar_deploy.dicom.header import is_dicom
+    from gcar_deploy.errors import UsageError
+    from gcar_deploy.files import natural_order
+    from gcar_deploy.imaging.read import SUFFIXES
+    from gcar_deploy.workbench.case import ORDER_NAME
+
+    found = sorted((path for path in folder.iterdir() if path.is_file()), key=natural_order)
+    pictures = tuple(p for p in found if p.suffix.lower() in SUFFIXES or is_dicom(p))
+    scene = folder / "geom.json"
+    if len(pictures) < 2:
+        raise UsageError(
+            f"{folder} holds no case ({ORDER_NAME}), no result (report.html) and no pictures of "
+            "two views"
+        )
+    geometry = scene if order.geometry is None and scene.is_file() else order.geometry
+    return dataclasses.replace(order, views=pictures, geometry=geometry)
+
+
 def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
     """Put on the desk what the command names; return the case's name, or the key of a result."""
-    from gcar_deploy.errors import ImageError, UsageError
+    from gcar_deploy.errors import ImageError
+    from gcar_deploy.workbench.case import ORDER_NAME
     from gcar_deploy.workbench.desk import absolute
 
     views = order.views
     if not views:
         return None, None
     if len(views) == 1 and views[0].is_dir():
-        try:
-            return str(desk.again(views[0]).id), None
-        except UsageError:
-            if not (views[0] / "report.html").is_file():
-                raise
-            return None, str(desk.shelve(views[0]))
+        folder = views[0]
+        if any((place / ORDER_NAME).is_file() for place in (folder, folder.resolve().parent)):
+            return str(desk.again(folder).id), None
+        if (folder / "report.html").is_file():
+            return None, str(desk.shelve(folder))
+        order = _of_folder(order, folder)
+    elif len(views) == 1 and not views[0].exists():
+        raise ImageError(f"{views[0]}: no such file or folder; check the path")
     check_views(order)
     for path in order.files.values():
         # The page would open, and show that nothing is there.

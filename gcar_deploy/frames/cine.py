@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,11 +16,11 @@ from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import Header, is_dicom, read_header
 from gcar_deploy.dicom.shutter import open_field
 from gcar_deploy.errors import ImageError
+from gcar_deploy.files import natural_order
 from gcar_deploy.imaging.read import is_stack, read_picture, read_stack
 from gcar_deploy.types import Image, Mask
 
 _SUFFIXES = (".png", ".tif", ".tiff", ".npy")
-_DIGITS = re.compile(r"(\d+)")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,7 +115,7 @@ def _of_folder(path: Path, options: RunOptions, subtracted: bool) -> Cine:
         files = [p for p in path.iterdir() if not p.name.startswith(".")]
     except OSError as error:
         raise ImageError(f"{path.name}: cannot be read ({error.strerror})") from None
-    pictures = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=_natural)
+    pictures = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=natural_order)
     limits = options.dicom.limits
     if not pictures and any(map(is_dicom, files)):
         raise ImageError(f"{path.name}: the folder holds DICOM files; name the run's file itself")
@@ -147,9 +146,3 @@ def _of_folder(path: Path, options: RunOptions, subtracted: bool) -> Cine:
 def _of_stack(path: Path, options: RunOptions, subtracted: bool) -> Cine:
     pages, depth, sha256 = read_stack(path, options.dicom.limits, subtracted=subtracted)
     return Cine(name=path.name, count=len(pages), read=lambda k: (pages[k], depth, sha256))
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key: frame 2 goes before frame 10."""
-    parts = _DIGITS.split(path.name)
-    return [(1, int(p), "") if k % 2 else (0, 0, p) for k, p in enumerate(parts)]

@@ -26,7 +26,8 @@ _NPY_DEPTH = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 _TYPE_OF = {8: np.uint8, 16: np.uint16, 32: np.float32}
 #: a multi-page file that is larger is no run
 _MOST_STACK_BYTES = DicomLimits().max_bytes
-_SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
+#: of pictures, and what they hold
+SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
 
 
 def read_picture(
@@ -126,7 +127,7 @@ def read_stack(
 
 
 def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Array, int]:
-    expected = _SUFFIXES.get(suffix)
+    expected = SUFFIXES.get(suffix)
     if data.startswith(_JPEG_SIGNATURE):
         raise ValueError(
             "is a JPEG picture: its compression loses thin vessels; export PNG, TIFF, NPY or DICOM"
