@@ -46,8 +46,8 @@ from gcar_deploy.inputs.drawn import (
 SCHEMA = "gcar-order/1"
 #: pictures of one order
 MOST_VIEWS = 16
-#: bytes of an order as JSON: a geometry may stand in it, and what was drawn in the pictures
-MAX_BYTES = 1024 * 1024
+#: bytes of an order as JSON: hours of drawing in the pictures may stand in it
+MAX_BYTES = 16 * 1024 * 1024
 #: a branch to be deleted is named by a place within so much of the isocentre, mm
 _FARTHEST_MM = 2000.0
 POSES = ("auto", "off")
@@ -223,8 +223,11 @@ def load_order(path: Path) -> Order:
 
 
 def order_to_json(order: Order) -> str:
-    """Return the order as the text of a file that reads back as the same order."""
-    return json.dumps(order.to_dict(), indent=1, allow_nan=False) + "\n"
+    """Return the order as the text of a file that reads back as the same order: a line a key."""
+    lines = (
+        f" {json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in order.to_dict().items()
+    )
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def check_views(order: Order) -> None:

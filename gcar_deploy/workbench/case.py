@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -15,18 +16,18 @@ import numpy as np
 
 from gcar_deploy.config import PictureLimits, RunOptions
 from gcar_deploy.dicom.header import is_dicom
-from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.errors import GcarError, GeometryError, UsageError
 from gcar_deploy.files import read_text
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.fields import read_json
 from gcar_deploy.geometry.frame import OwnFrame
-from gcar_deploy.geometry.scene import Scene, View, scene_to_json
+from gcar_deploy.geometry.scene import Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.frame import ChosenFrame
 from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.vessels import Vessels
-from gcar_deploy.inputs.order import Order, order_to_json, parse_order
+from gcar_deploy.inputs.order import MAX_BYTES, Order, order_to_json, parse_order
 from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.result import Result
 from gcar_deploy.steps import Step
@@ -34,6 +35,8 @@ from gcar_deploy.types import Array
 
 ORDER_NAME = "order.json"
 RESULT_NAME = "result"
+#: says that the order was refused: a result that lies beside is of an earlier one
+REFUSED_NAME = "refused.txt"
 #: what the page may change of an order
 CORRECTIONS = (
     "edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry",
@@ -60,6 +63,7 @@ class Case:
     pair_scores : numbers of two views, from 1, the lower first -> (n, m) how well each frame of
         the one goes with each of the other, 0 .. 1; empty where nobody judged pairs
     proposed : number of a view -> frame that was chosen together with that of another view
+    revision : how often the order was kept
     """
 
     def __init__(self, folder: Path, order: Order) -> None:
@@ -74,8 +78,9 @@ class Case:
         self._read: tuple[str, tuple[tuple[Angiogram, ...], list[str]]] | None = None
         self._judged: tuple[tuple[Angiogram, ...], tuple[Angiogram, ...]] | None = None
         self._lock = threading.Lock()
-        self.order = dataclasses.replace(order, out=Path(RESULT_NAME), force=True)
-        self._keep()
+        self._kept: str | None = None
+        self.revision = 0
+        self.order = self._keep(dataclasses.replace(order, out=Path(RESULT_NAME), force=True))
 
     @property
     def order_file(self) -> Path:
@@ -87,21 +92,46 @@ class Case:
         """The order with full paths."""
         return self.order.relative_to(self.folder)
 
-    def correct(self, values: Mapping[str, Any]) -> None:
+    def correct(self, values: Mapping[str, Any], revision: int | None = None) -> None:
         """Replace the corrections that are given; null or nothing takes them back.
+
+        Parameters
+        ----------
+        values : what is corrected -> how
+        revision : of the order that whoever corrects has seen; None overwrites any
 
         Raises
         ------
         UsageError
-            A key is no correction, or its value is wrong: nothing is changed then.
+            A key is no correction, its value is wrong, somebody else has corrected the case
+            since, or the order cannot be kept: nothing is changed then.
         """
         for key in values:
             if key not in CORRECTIONS:
                 raise UsageError(f"key {key[:40]!r} is none of {', '.join(CORRECTIONS)}")
         with self._lock:
+            if revision not in (None, self.revision):
+                raise UsageError(
+                    "the case was corrected elsewhere since (another tab?): it is shown as it is "
+                    "now; what you did last was not kept"
+                )
             told = {**self.order.to_dict(), **values}
-            self.order = parse_order({k: v for k, v in told.items() if v not in (None, [], {})})
-            self._keep()
+            order = parse_order({k: v for k, v in told.items() if v not in (None, [], {})})
+            if isinstance(values.get("geometry"), Mapping):
+                _check_geometry(values["geometry"])
+            self.order = self._keep(order)
+
+    def say_refused(self, reason: str | None) -> None:
+        """Keep beside the result that the order of now has none; None where it has."""
+        file = self.folder / REFUSED_NAME
+        with contextlib.suppress(OSError):
+            if reason is None:
+                file.unlink(missing_ok=True)
+            else:
+                told = (
+                    f"{ORDER_NAME} was refused: {reason}\n{RESULT_NAME} is of an earlier order.\n"
+                )
+                file.write_text(told, encoding="utf-8")
 
     def take_step(self, step: Step) -> None:
         """Remember what a run hands on, so that a refused one can be looked at as well."""
@@ -137,7 +167,8 @@ class Case:
     def described(self) -> dict[str, Any]:
         """Return all that the page shows before a run, as JSON values; a problem is a sentence."""
         out: dict[str, Any] = {
-            "id": self.id, "key": self.key, "order": self.order.to_dict(),
+            "id": self.id, "key": self.key, "revision": self.revision,
+            "order": self.order.to_dict(),
             "order_file": str(self.order_file), "names": [p.name for p in self.order.views],
             "views": [], "notes": [], "geometry": None, "problem": None, "sizes": None,
             "job": self.job_id, "result": self.result is not None,
@@ -149,6 +180,9 @@ class Case:
         except GcarError as error:
             out["problem"] = str(error)
             out["sizes"] = self._sizes()
+            # What is wrong can be put right only where it is shown.
+            if isinstance(self.order.geometry, Mapping):
+                out["geometry"] = self.order.geometry
             return out
         out["notes"] = notes
         out["views"] = [
@@ -227,14 +261,39 @@ class Case:
         views = tuple(View(id=a.view_id, carm=a.carm, intensity=a.intensity) for a in angiograms)
         return json.loads(scene_to_json(Scene(views=views)))
 
-    def _keep(self) -> None:
-        new = self.folder / (ORDER_NAME + ".new")
-        new.write_text(order_to_json(self.order), encoding="utf-8")
-        new.replace(self.order_file)
+    def _keep(self, order: Order) -> Order:
+        """Write the order into the folder, unless another program did so since; return it."""
+        text, file = order_to_json(order), self.order_file
+        if len(text) > MAX_BYTES:
+            raise UsageError(
+                f"{ORDER_NAME} would be larger than the {MAX_BYTES >> 20} MiB that are read: take "
+                "some of what was drawn back"
+            )
+        new = file.with_name(ORDER_NAME + ".new")
+        try:
+            if self._kept is not None and file.read_text(encoding="utf-8") != self._kept:
+                raise UsageError(
+                    f"{file} was changed by another program: open the case again to go on"
+                )
+            new.write_text(text, encoding="utf-8")
+            new.replace(file)
+        except OSError as error:
+            raise UsageError(f"{file} cannot be written ({error.strerror}): not kept") from None
+        self._kept = text
+        self.revision += 1
+        return order
 
 
 #: keys of an order that tell how its pictures are read
 _READING = ("views", "geometry", "masks", "frames", "pixel_spacing_mm", "sod_mm", "allow_rescale")
+
+
+def _check_geometry(told: Mapping[str, Any]) -> None:
+    """Refuse a geometry that no picture could be read with: the page would show nothing."""
+    try:
+        parse_scene(json.dumps(told), "geometry")
+    except GeometryError as error:
+        raise UsageError(str(error)) from None
 
 
 @functools.lru_cache(maxsize=8)

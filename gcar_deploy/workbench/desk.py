@@ -118,11 +118,13 @@ class Desk:
             result = engine.reconstruct_order(
                 order, on_progress=on_progress, cancel=cancel, on_step=case.take_step
             )
-        except RefusedError:
+        except RefusedError as error:
             # What an earlier order gave is not what this one gives; its files stay.
             case.result = None
+            case.say_refused(str(error))
             raise
         folder = deliver(result, order)
+        case.say_refused(None)
         case.result = result
         return result.summary(), folder
 

@@ -18,6 +18,7 @@ from flask import Flask, Response, request, send_from_directory
 from gcar_deploy import __version__
 from gcar_deploy.dicom.choose import choose_frame, filling_and_motion
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.files import natural_order
 from gcar_deploy.inputs.drawn import parse_point
 from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
 from gcar_deploy.reconstruction import RESEARCH_USE
@@ -107,8 +108,9 @@ def _cases(app: Flask, desk: Desk, first: str | None) -> None:
 
     @app.put("/api/cases/<case_id>/order")
     def correct(case_id: str) -> Any:
-        case = _case(desk, case_id)
-        case.correct(_object())
+        case, values = _case(desk, case_id), _object()
+        revision = values.pop("revision", None)
+        case.correct(values, revision)
         return case.described()
 
     @app.get("/api/cases/<case_id>/result")
@@ -260,7 +262,9 @@ def _png(data: bytes) -> Response:
 
 def _uploaded(desk: Desk) -> Case:
     """Make a case of the parts ``file``: pictures or runs by name, ``*.json`` is the geometry."""
-    files = sorted(request.files.getlist("file"), key=lambda file: file.filename or "")
+    files = sorted(
+        request.files.getlist("file"), key=lambda file: natural_order(Path(file.filename or ""))
+    )
     scenes = [file for file in files if suffix_of(file.filename or "") == ".json"]
     views = [file for file in files if file not in scenes]
     if not 2 <= len(views) <= MOST_VIEWS or len(scenes) > 1:

@@ -74,6 +74,7 @@ def browse(chromium):
         page.goto(f"{address}/#{TOKEN}")
         return page
 
+    open_page.complaints = complaints  # for a test that provokes one
     yield open_page
     for context in contexts:
         context.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import time
 from pathlib import Path
@@ -288,6 +289,48 @@ def test_tools_write_what_they_say(serve, browse):
     until_order(page, case, lambda o: len(o["edits"]["1"]) == 1)
     page.click("#corrections li:has-text('region') button")
     until_order(page, case, lambda o: "regions" not in o)
+
+
+@pytest.mark.slow
+def test_one_press_of_delete_deletes_one_branch(serve, browse):
+    address, cases = serve(lambda desk: desk.demo().id)
+    page = browse(address, 1500)
+    finished(page)
+    page.locator("#lesions tbody tr[data-branch='5'] button.plain").click()
+    page.keyboard.press("Delete")
+    page.keyboard.press("Delete")
+    until_order(page, cases / "demo", lambda o: "deleted_mm" in o)
+    finished(page)
+    page.keyboard.press("Delete")
+    page.wait_for_timeout(300)
+    assert len(order_of(cases / "demo")["deleted_mm"]) == 1
+    assert page.locator("#lesions tr.chosen").count() == 0
+
+
+@pytest.mark.slow
+def test_a_long_scribble_is_kept_whole_and_tabs_do_not_wipe_each_other(serve, browse):
+    address, cases = serve(lambda desk: desk.demo().id)
+    page, other = browse(address, 1500), browse(address, 1500)
+    case = cases / "demo"
+    for one in (page, other):
+        finished(one)
+        one.click("[data-tool=erase]")
+    page.locator("#brush").fill("3")
+    rows = [((20, y), (490, y)) for y in range(20, 60, 4)]
+    stroke(page, 1, [place for k, row in enumerate(rows) for place in row[:: 1 - 2 * (k % 2)]])
+    until_order(page, case, lambda o: "edits" in o)
+    strokes = order_of(case)["edits"]["1"]
+    points = np.concatenate([one["points"] for one in strokes])
+    assert points[:, 1].max() > 50 and all(len(one["points"]) <= 2000 for one in strokes)
+    assert all(a["points"][-1] == b["points"][0] for a, b in itertools.pairwise(strokes))
+    stroke(other, 2, [(20, 20), (60, 20)])
+    until(other, lambda: "corrected elsewhere" in other.inner_text("#message"))
+    assert other.locator("#corrections li").count() == len(strokes)
+    assert len(browse.complaints) == 1 and "400" in browse.complaints.pop()
+    assert list(order_of(case)["edits"]) == ["1"]
+    stroke(other, 2, [(20, 20), (60, 20)])
+    until_order(other, case, lambda o: "2" in o["edits"])
+    assert order_of(case)["edits"]["1"] == strokes
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from gcar_deploy.engine import Engine
+from gcar_deploy.inputs.order import load_order
 from gcar_deploy.workbench import http
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.worker.jobs import JobQueue
@@ -87,6 +88,9 @@ def test_a_refused_run_leaves_no_result_of_an_earlier_order(ask, desk):
     assert ran() == "refused" and case.described()["result"] is False
     assert ask("GET", f"/api/cases/{case.id}/result").status_code == 400
     assert (case.folder / "result" / "result.json").read_bytes() == made
+    assert (case.folder / "refused.txt").read_text().startswith("order.json was refused: no vessel")
+    assert ask("PUT", f"/api/cases/{case.id}/order", json={"edits": None}).status_code == 200
+    assert ran() == "done" and not (case.folder / "refused.txt").exists()
 
 
 def test_result_files_have_an_address_of_their_own(ask, desk):
@@ -116,6 +120,56 @@ def test_wrong_corrections_change_nothing(ask, desk, values, words):
     assert answer.status_code == 400 and words in answer.json["error"]["message"]
 
 
+def test_who_has_not_seen_a_correction_does_not_undo_it(ask, desk):
+    case = desk.demo()
+    path, seen = f"/api/cases/{case.id}/order", case.described()["revision"]
+
+    def put(**values):
+        return ask("PUT", path, json={"revision": seen, **values})
+
+    stroke = [{"do": "erase", "width_px": 3, "points": [[9, 9], [20, 9]]}]
+    assert put(edits={"1": stroke}).json["revision"] == seen + 1
+    late = put(edits={"2": stroke})
+    assert late.status_code == 400 and "corrected elsewhere" in late.json["error"]["message"]
+    assert list(json.loads(case.order_file.read_text())["edits"]) == ["1"]
+    # Another program, which has opened the same folder.
+    Desk(case.folder.parent).again(case.folder).correct(
+        {"regions": {"1": [[0, 0], [9, 0], [9, 9]]}}
+    )
+    late = ask("PUT", path, json={"edits": {"2": stroke}})
+    assert late.status_code == 400 and "another program" in late.json["error"]["message"]
+    assert "regions" in json.loads(case.order_file.read_text()) and list(case.order.edits) == [1]
+
+
+def test_what_cannot_be_kept_is_not_taken(ask, desk, monkeypatch):
+    case = desk.demo()
+    stroke = [{"do": "erase", "width_px": 3, "points": [[9.5, 9]] * 2000}]
+
+    def put(strokes):
+        return ask("PUT", f"/api/cases/{case.id}/order", json={"edits": {"1": strokes}})
+
+    # Hours of drawing are read again as they were kept.
+    assert put(stroke * 200).status_code == 200
+    assert load_order(case.order_file).edits == case.order.edits and len(case.order.edits[1]) == 200
+    before = case.order_file.read_bytes()
+    monkeypatch.setattr("gcar_deploy.workbench.case.MAX_BYTES", len(before))
+    assert "would be larger than" in put(stroke * 201).json["error"]["message"]
+    monkeypatch.undo()
+    case.order_file.with_name("order.json.new").mkdir()
+    answer = put(stroke)
+    assert answer.status_code == 400 and "cannot be written" in answer.json["error"]["message"]
+    assert case.order_file.read_bytes() == before and len(case.order.edits[1]) == 200
+
+
+def test_a_geometry_that_shows_nothing_is_not_taken(ask, desk):
+    case = desk.demo()
+    told = case.described()["geometry"]
+    told["views"][1]["sod_mm"] = 1200
+    answer = ask("PUT", f"/api/cases/{case.id}/order", json={"geometry": told})
+    assert answer.status_code == 400 and "sdd_mm" in answer.json["error"]["message"]
+    assert case.described()["problem"] is None
+
+
 def test_dropped_files_become_a_case(ask, desk, good_case):  # noqa: F811
     def drop(*names):
         files = [("file", (io.BytesIO((good_case / n).read_bytes()), n)) for n in names]
@@ -129,6 +183,14 @@ def test_dropped_files_become_a_case(ask, desk, good_case):  # noqa: F811
         "view1.png", "view2.png",
     ]  # fmt: skip
     assert drop("view1.png", "geom.json").json["error"]["message"].startswith("1 pictures and 1")
+
+    def content(case):
+        folder = desk.case(case.json["id"]).folder
+        return [(folder / name).read_bytes() for name in case.json["order"]["views"]]
+
+    (good_case / "b10.png").write_bytes((good_case / "view1.png").read_bytes())
+    (good_case / "b9.png").write_bytes((good_case / "view2.png").read_bytes())
+    assert content(drop("b10.png", "b9.png", "geom.json")) == content(found)[::-1]
     bare = drop("view1.png", "view2.png")
     assert "geometry is needed" in bare.json["problem"]
     view = json.loads((good_case / "geom.json").read_text())["views"][0]

@@ -14,7 +14,10 @@ async function answer(method, path, body) {
     headers["Content-Type"] = "application/json";
     content = JSON.stringify(body);
   }
-  const found = await fetch(path, { method, headers, body: content });
+  let found;
+  try { found = await fetch(path, { method, headers, body: content }); } catch {
+    throw new Error("The program behind this page does not answer: it was stopped. Start gcar open again; what was done last was not kept.");
+  }
   if (!found.ok) {
     let text = `${found.status} ${found.statusText}`;
     try { text = (await found.json()).error.message; } catch { /* no JSON: the status says it */ }

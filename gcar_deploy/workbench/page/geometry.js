@@ -1,6 +1,8 @@
 // Where each view was taken from: a drawing of the C-arm, and its numbers to be edited.
 import { $, direction, el } from "./dom.js";
 
+/** What the counts of a picture can be. */
+const KINDS = [["raw", "an X-ray picture as it was taken"], ["mask", "a mask: vessel or not"], ["path_length", "lengths of the path through vessel"]];
 const FIELDS = [
   ["primary_angle_deg", "RAO \u2212 / LAO +", "\u00b0", -180, 180],
   ["secondary_angle_deg", "Caudal \u2212 / cranial +", "\u00b0", -90, 90],
@@ -27,18 +29,25 @@ function asked(store, say) {
     return { rows, columns, inputs, node: el("div", { class: "carm" }, el("h3", {}, `View ${k + 1}: ${store.info.names[k]}, ${columns} x ${rows}`),
       el("div", { class: "numbers" }, ...inputs.flatMap(([name, unit, input]) => [el("label", { for: input.id }, name), input, el("span", {}, unit)]))) };
   });
+  const scale = el("input", { type: "number", id: "new-scale", min: 1e-9, max: 1000, step: "any" });
+  const per = el("span", { hidden: true }, el("label", { for: scale.id }, " mm per count "), scale);
+  const kind = el("select", { id: "new-kind", onchange: () => {
+    per.hidden = kind.value !== "path_length"; scale.required = !per.hidden;
+  } }, ...KINDS.map(([value, text]) => el("option", { value }, text)));
   const use = async e => {
     e.preventDefault();
+    const intensity = kind.value === "path_length" ? { kind: kind.value, mm_per_count: Number(scale.value) } : { kind: kind.value };
     const read = ({ rows, columns, inputs }, k) => {
       const told = Object.fromEntries(inputs.map(([, , input]) => [input.name, Number(input.value)]));
-      return { id: String(k + 1), ...told, rows, columns, pixel_spacing_mm: [told.pixel_spacing_mm, told.pixel_spacing_mm] };
+      return { id: String(k + 1), ...told, rows, columns, intensity, pixel_spacing_mm: [told.pixel_spacing_mm, told.pixel_spacing_mm] };
     };
     try {
       await store.change({ geometry: { schema: "gcar-geometry/1", frame: "LPS", views: views.map(read) } });
       if (!store.info.problem) { say(""); await store.run(); }
     } catch (error) { say(error.message); }
   };
-  return el("form", { class: "cards", onsubmit: use }, ...views.map(view => view.node), el("p", {}, el("button", { class: "main" }, "Use this geometry")));
+  return el("form", { class: "cards", onsubmit: use }, ...views.map(view => view.node),
+    el("p", {}, el("label", { for: kind.id }, "The pictures are "), kind, per), el("p", {}, el("button", { class: "main" }, "Use this geometry")));
 }
 
 function card(store, say, view, k) {
@@ -54,10 +63,14 @@ function card(store, say, view, k) {
 
 async function edit(store, say, k, key, input) {
   const value = Number(input.value);
-  if (!input.checkValidity() || input.value === "") { say(`View ${k + 1}: ${key} must be ${input.min} .. ${input.max}`); return; }
+  if (!input.checkValidity() || input.value === "") { geometry(store, say); say(`View ${k + 1}: ${key} must be ${input.min} .. ${input.max}`); return; }
   const told = structuredClone(store.info.geometry);
   told.views[k][key] = key === "pixel_spacing_mm" ? [value, value] : value;
-  try { await store.change({ geometry: told }); } catch (error) { say(error.message); }
+  try { await store.change({ geometry: told }); say(""); } catch (error) {
+    // What was refused must not stand in its field.
+    geometry(store, say);
+    say(error.message);
+  }
 }
 
 const NS = "http://www.w3.org/2000/svg";

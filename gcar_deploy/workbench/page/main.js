@@ -16,6 +16,8 @@ const tools = new Toolbox(store, say);
 const curve = new Curve(store);
 let pictures = [], scene = new Scene3D(store);
 
+const UNTOLD = "These pictures came without their geometry. Say below where each was taken from, or drop them again together with their geom.json.";
+
 function say(text, good = false) {
   $("message").hidden = !text;
   $("message").className = good ? "message good" : "message";
@@ -45,7 +47,7 @@ async function open(info, run = true) {
   $("case-name").textContent = info.id; document.title = `${info.id} \u2013 gcar`;
   scene = new Scene3D(store);
   store.open(info);
-  if (info.problem) { say(info.problem); $("geometry").open = true; }
+  if (info.problem) { say(info.sizes ? UNTOLD : info.problem); $("geometry").open = true; }
   else if (run) await store.run();
 }
 async function send(list) {
@@ -77,6 +79,7 @@ async function loadFound() {
 function lay() {
   pictures = store.info.views.map((_, k) => new Picture(store, k + 1, tools, look));
   tools.pictures = pictures; tools.clear();
+  scene.root.hidden = !pictures.length;
   $("pictures").replaceChildren(...pictures.map(p => p.root), scene.root);
   $("tools").hidden = !pictures.length;
   attempt(load);
@@ -99,7 +102,11 @@ const pick = one => attempt(async () => {
 });
 /** Delete a branch: its middle names it in the order, whatever its number will be. */
 const erase = branch => attempt(async () => {
-  await store.change({ deleted_mm: [...store.now.deleted_mm ?? [], branch.middle] });
+  const gone = store.now.deleted_mm ?? [];
+  // A second press while the first is under way names the same branch.
+  if (gone.some(place => JSON.stringify(place) === JSON.stringify(branch.middle))) return;
+  store.choose(0);
+  await store.change({ deleted_mm: [...gone, branch.middle] });
   await store.run();
 });
 
@@ -143,7 +150,8 @@ window.addEventListener("dragover", e => { e.preventDefault(); drop.classList.ad
 window.addEventListener("dragleave", () => drop.classList.remove("over"));
 window.addEventListener("drop", e => { e.preventDefault(); drop.classList.remove("over"); if (e.dataTransfer.files.length) attempt(() => send(e.dataTransfer.files)); });
 window.addEventListener("resize", draw);
-window.addEventListener("beforeprint", draw);
+window.addEventListener("beforeprint", () => { document.querySelectorAll(".status .said").forEach(list => { list.open = true; }); draw(); });
+window.matchMedia("print").addEventListener("change", draw);
 
 window.addEventListener("keydown", e => {
   if ($("case").hidden || e.target.matches("input, select")) return;

@@ -11,10 +11,10 @@ export function status(store) {
   const { summary } = result, said = [...(summary.findings.length > 1 ? summary.findings : []), ...summary.notes];
   const facts = [["views apart", `${summary.separation_deg.toFixed(0)}\u00b0`], ["branches", summary.tree.branches.length],
     ["centreline", `${summary.tree.length_mm.toFixed(0)} mm`], ["time", `${summary.seconds.total.toFixed(1)} s`]];
-  const list = (name, lines) => lines.length ? el("details", {}, el("summary", {}, `${name} (${lines.length})`), el("ul", {}, ...lines.map(text => el("li", {}, text)))) : null;
+  const list = (name, lines, kind) => lines.length ? el("details", { class: kind }, el("summary", {}, `${name} (${lines.length})`), el("ul", {}, ...lines.map(text => el("li", {}, text)))) : null;
   box.replaceChildren(el("b", {}, word), summary.sentence,
     el("div", { class: "facts" }, ...facts.map(([name, value]) => el("span", {}, `${name} `, el("b", {}, String(value))))),
-    ...[list("Findings and notes", said), list("What no picture can show", summary.silent_errors)].filter(x => x));
+    ...[list("Findings and notes", said, "said"), list("What no picture can show", summary.silent_errors, "silent")].filter(x => x));
 }
 
 /** One line a stated alternative, to be looked at and, where a correction picks it, picked. */
@@ -45,6 +45,7 @@ export function corrections(store, say) {
   (now.same_branch ?? []).forEach((_, k) => add(`Same branch B${k + 1}`, { same_branch: without(now.same_branch, k) }));
   (now.ostia ?? []).forEach((_, k) => add(`Ostium O${k + 1}`, { ostia: without(now.ostia, k) }));
   (now.deleted_mm ?? []).forEach((place, k) => add(`Branch deleted at (${place.map(x => x.toFixed(0)).join(", ")}) mm`, { deleted_mm: without(now.deleted_mm, k) }));
+  if (now.geometry && store.told !== undefined && JSON.stringify(now.geometry) !== JSON.stringify(store.told)) add("Geometry", { geometry: store.told });
   $("corrections").hidden = !lines.length;
   $("corrections").querySelector("ul").replaceChildren(...lines);
 }
@@ -55,6 +56,9 @@ const ABOUT = {
   "centerline.csv": "centreline (table)", "diameters.csv": "diameters (table)", "gaussians.npz": "Gaussians", "gaussians.ply": "Gaussians (3DGS)",
 };
 
+/** A path as a shell takes it. */
+const quoted = path => /^[\w./:\\-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\\''")}'`;
+
 export function files(store) {
   const room = $("files-of").querySelector("div");
   $("files-of").hidden = !store.result;
@@ -63,7 +67,7 @@ export function files(store) {
   const link = name => el("a", { href: `${base}/${name}`, ...(name === "report.html" ? { target: "_blank" } : { download: name }) },
     `${name}${ABOUT[name] ? ` \u2013 ${ABOUT[name]}` : ""}`);
   const model = one => one ? `${one.name} (${one.sha256.slice(0, 12)})` : "none";
-  const rows = [["Order", store.info.order_file], ["Repeat", `gcar run --order ${store.info.order_file}`],
+  const rows = [["Order", store.info.order_file], ["Repeat", `gcar run --order ${quoted(store.info.order_file)}`],
     ["Centres", summary.predictor], ["Model", model(summary.model)], ["Vessel network", model(summary.segmenter)],
     ["Refinement", `${summary.refiner}, ${summary.counts.steps} steps`],
     ...summary.views.map(v => [`Picture ${v.id}`, `${v.picture.columns} x ${v.picture.rows}, ${v.picture.bit_depth} bit, ${v.kind}, SHA-256 ${v.picture.sha256.slice(0, 12)}`]),

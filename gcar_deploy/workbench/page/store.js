@@ -4,6 +4,8 @@ import * as api from "./api.js";
 // What is undone and redone: keys of the order that the page changes.
 const KEYS = ["edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry"];
 const corrections = order => Object.fromEntries(KEYS.map(key => [key, order[key] ?? null]));
+/** A branch of a new result is an earlier one where their middles lie so near, mm. */
+const SAME_MM = 5;
 const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 export class Store extends EventTarget {
@@ -21,7 +23,7 @@ export class Store extends EventTarget {
 
   open(info) {
     this.#runs++; this.running = false;
-    Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null, spot: null });
+    Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null, spot: null, told: info.order.geometry ?? null });
     this.#past.length = 0; this.#future.length = 0;
     this.tell("opened");
   }
@@ -53,21 +55,35 @@ export class Store extends EventTarget {
       await this.#send(after);
       from.pop(); to.push(before);
       this.tell("changed");
-      return !same(before.deleted_mm, after.deleted_mm) || !same(before.ostia, after.ostia);
+      return ["deleted_mm", "ostia", "same_branch"].some(key => !same(before[key], after[key]));
     });
     // Only a new run shows what becomes of a tree; strokes are seen at once.
     if (again) await this.run();
   }
 
+  /** Send what differs; the server refuses where somebody else has corrected the case since. */
   async #send(values) {
-    const geometry = !same(values.geometry, this.now.geometry), frames = !same(values.frames, this.now.frames);
-    this.info = await api.put(`${this.path}/order`, values);
-    if (geometry || frames) this.tell("pictures");
+    const now = this.now, changed = Object.fromEntries(Object.entries(values).filter(([key, value]) => !same(value, now[key])));
+    try {
+      this.info = await api.put(`${this.path}/order`, { ...changed, revision: this.info.revision });
+    } catch (error) {
+      await this.#refresh();
+      throw error;
+    }
+    if ("geometry" in changed || "frames" in changed) this.tell("pictures");
+  }
+  /** Show the case as the server has it; what was undone before belongs to another one. */
+  async #refresh() {
+    const info = await api.get(this.path).catch(() => null);
+    if (!info || info.revision === this.info.revision) return;
+    this.info = info;
+    this.#past.length = 0; this.#future.length = 0;
+    this.tell("pictures"); this.tell("changed");
   }
 
   async run() {
     if (this.running) await this.cancel();
-    const asked = this.now, path = this.path, own = ++this.#runs;
+    const asked = this.now, path = this.path, own = ++this.#runs, chosen = this.branch(this.chosen);
     this.running = true;
     this.tell("progress");
     try {
@@ -78,10 +94,13 @@ export class Store extends EventTarget {
       const result = done.state === "done" ? await api.get(`${path}/result`) : null;
       // A later run, or another case, has taken over.
       if (own !== this.#runs) return;
-      Object.assign(this, { ran: asked, result });
-      if (this.result) {
-        const branches = this.result.scene.branches;
-        this.chosen = branches.some(b => b.branch === this.chosen) ? this.chosen : worst(branches);
+      // A cancelled run says nothing: what was there before stays.
+      if (done.state !== "cancelled") {
+        const before = this.result;
+        Object.assign(this, { ran: asked, result });
+        // Branches are numbered anew: the chosen one is known by its place. What was deleted
+        // leaves none chosen, so that no second key deletes another.
+        if (result) this.chosen = before && !chosen ? 0 : again(result.scene.branches, chosen, before !== null);
         this.cursor = this.spot = null;
       }
       this.tell("finished");
@@ -103,6 +122,14 @@ export class Store extends EventTarget {
   /** A stated alternative, whose place all drawings mark. */
   show(spot) { if (spot.branches.length) this.chosen = spot.branches[0]; this.cursor = null; this.spot = spot; this.tell("chosen"); }
   branch(number) { return this.result?.scene.branches.find(b => b.branch === number) ?? null; }
+}
+
+/** The branch that runs where a chosen one did, 0 where none does; to begin with the worst. */
+function again(branches, chosen, had) {
+  if (!had || !chosen) return worst(branches);
+  const gap = b => Math.hypot(...b.middle.map((x, k) => x - chosen.middle[k]));
+  const near = [...branches].sort((a, b) => gap(a) - gap(b))[0];
+  return near && gap(near) < SAME_MM ? near.branch : 0;
 }
 
 /** The branch to begin with: the one with the most severe narrowing. */

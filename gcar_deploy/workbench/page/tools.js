@@ -5,7 +5,7 @@ import { $, el, label, ring } from "./dom.js";
 export const TOOLS = [
   ["look", "Look", "V", "Drag to move, wheel to zoom; click a vessel to choose it."],
   ["erase", "Erase", "E", "Draw over what is no vessel: catheter, wire, rib."],
-  ["paint", "Paint", "P", "Draw where a vessel is missing; the line's width becomes its diameter."],
+  ["paint", "Paint", "P", "Draw where a vessel is missing, in every view that shows it, as wide as it is."],
   ["cut", "Cut catheter", "C", "Click the catheter at both ends of the part to be cut; the line between is found."],
   ["region", "Region", "G", "Click the corners of what is to be looked at; double-click or Enter closes it."],
   ["landmark", "Landmark pair", "L", "Click a point (a fork, a kink) in one view, then the same in the other, on the dashed line."],
@@ -15,6 +15,8 @@ export const TOOLS = [
 const round = point => point.map(x => Math.round(x * 10) / 10);
 const KEYS = { landmark: "landmarks", same: "same_branch", ostium: "ostia" };
 const INK = { erase: "#ff7a33", paint: "#56b4e9" };
+/** Points of one stroke of an order. */
+const MOST = 2000;
 /** A click this near to a crossing is put onto it, CSS pixels. */
 const SNAP = 18;
 
@@ -51,11 +53,14 @@ export class Toolbox {
     this.stroke = null;
     if (!stroke) return;
     stroke.points.push(round(place));
-    this.add(stroke.view, { do: this.name, width_px: this.brush, points: stroke.points.slice(0, 2000) });
+    const strokes = [];
+    // Pieces share an end, so that no gap is left between them.
+    for (let k = 0; k === 0 || k < stroke.points.length - 1; k += MOST - 1) strokes.push({ do: this.name, width_px: this.brush, points: stroke.points.slice(k, k + MOST) });
+    this.add(stroke.view, ...strokes);
   }
-  add(view, stroke) {
+  add(view, ...strokes) {
     const edits = this.store.now.edits ?? {};
-    this.change({ edits: { ...edits, [view]: [...edits[view] ?? [], stroke] } });
+    this.change({ edits: { ...edits, [view]: [...edits[view] ?? [], ...strokes] } });
   }
 
   /** A click that is no stroke; true where the tool takes it. */
