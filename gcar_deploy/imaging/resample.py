@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.types import Array, Image
+from gcar_deploy.types import Array, Image, Mask
 
 
 def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
@@ -30,33 +30,42 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     """
     if rows < 1 or columns < 1:
         raise UsageError(f"cannot resize a view to {columns} x {rows} pixels")
-    old = vessel_image
-    if (rows, columns) == old.mask.shape:
-        return old
-    path = area_average(old.path_mm, rows, columns)
-    line = area_average(old.skeleton.astype(np.float32), rows, columns) > 0
-    mask = (area_average(old.mask.astype(np.float32), rows, columns) >= 0.5) | line
+    if (rows, columns) == vessel_image.mask.shape:
+        return vessel_image
+    carm = vessel_image.carm.resized(rows, columns)
+    return _averaged(vessel_image, carm, lambda picture: area_average(picture, rows, columns))
+
+
+def coarser_view(view: VesselImage, factor: int) -> VesselImage:
+    """``resized`` to pixels ``factor`` times as large, which meet at the principal point."""
+    carm, _ = coarsened(view.carm, (), factor)
+    return _averaged(view, carm, lambda picture: coarsened(view.carm, (picture,), factor)[1][0])
+
+
+def _averaged(old: VesselImage, carm: CArm, average: Callable[[Image], Image]) -> VesselImage:
+    """Return the view of larger pixels that hold the ``average`` of the old ones."""
+
+    def share(of: Mask) -> Image:
+        return average(of.astype(np.float32))
+
+    path = average(old.path_mm)
+    mask = (share(old.mask) >= 0.5) | (share(old.skeleton) > 0)
     mask &= path > 0
-    valid = area_average(old.valid.astype(np.float32), rows, columns) >= 0.5
     response, catheter, device = old.vesselness, old.catheter, old.device
     painted = old.painted
-    if painted is not None:
-        painted = area_average(painted.astype(np.float32), rows, columns) > 0
-    if catheter is not None:
-        catheter = (area_average(catheter.astype(np.float32), rows, columns) >= 0.5) & ~mask
     return dataclasses.replace(
         old,
         others=(),
         kept=None,
-        carm=old.carm.resized(rows, columns),
+        carm=carm,
         path_mm=path,
         mask=mask,
         skeleton=skel.skeletonize(mask),
-        valid=valid,
-        vesselness=None if response is None else area_average(response, rows, columns),
-        catheter=catheter,
-        painted=painted,
-        device=None if device is None else area_average(device, rows, columns),
+        valid=share(old.valid) >= 0.5,
+        vesselness=None if response is None else average(response),
+        catheter=None if catheter is None else (share(catheter) >= 0.5) & ~mask,
+        painted=None if painted is None else share(painted) > 0,
+        device=None if device is None else average(device),
     )
 
 

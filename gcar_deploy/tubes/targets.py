@@ -11,12 +11,14 @@ import numpy as np
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.imaging.resample import coarsened
+from gcar_deploy.imaging.resample import coarsened, coarser_view
 from gcar_deploy.tubes.model import Shown
 from gcar_deploy.types import Array, Scalars
 
 #: extra blur of the coarse levels (sigma in pixels), which widens the reach of the gradient.
 COARSE_BLUR_PX = 0.6
+#: which tree explains the pictures better is asked of pixels up to this size, mm at the isocentre
+TRIAL_MM = 0.25
 #: how many of the paths' relative errors the contrast factor may be off.
 CONTRAST_SIGMAS = 6.0
 
@@ -91,6 +93,17 @@ def make_targets(
     options : TubeOptions
     """
     return [_target(view, level_mm, options) for view in views]
+
+
+def trial_views(views: Sequence[VesselImage]) -> Sequence[VesselImage]:
+    """Coarsen pictures to what trees are tried on; the same ones where none is so fine."""
+    factors = [int(TRIAL_MM / view.carm.pixel_at_isocenter_mm + 1e-6) for view in views]
+    if max(factors) < 2:
+        return views
+    return [
+        coarser_view(view, factor) if factor > 1 else view
+        for view, factor in zip(views, factors, strict=True)
+    ]
 
 
 def _target(view: VesselImage, level_mm: float, options: TubeOptions) -> Target:

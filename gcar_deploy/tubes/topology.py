@@ -24,7 +24,7 @@ from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
 from gcar_deploy.tubes.model import Shown
 from gcar_deploy.tubes.proposal import Told, proposal
 from gcar_deploy.tubes.run import Run, State, Trial, coarsest_pixel_mm
-from gcar_deploy.tubes.targets import Target
+from gcar_deploy.tubes.targets import Target, make_targets, trial_views
 from gcar_deploy.types import Points
 
 #: a vessel that was missed is kept where it lowers the objective by this share ...
@@ -73,7 +73,9 @@ def settled_topology(
     whole = loose_mm(now.tree) < LEAST_LOOSE_MM and not _lines(now, views, targets)[1]
     if whole and not _doubted(now, run.progress.losses[-1], targets, run):
         return now
-    told = Told.by(run.evidence)
+    told, own, coarse = Told.by(run.evidence), targets, trial_views(views)
+    if coarse is not views:
+        views, targets = coarse, make_targets(coarse, 0.0, run.options)
     # What has to be beaten has had as many steps, from as near a start.
     best = given = run.tried(now.tree, targets)
     if not whole:
@@ -81,6 +83,8 @@ def settled_topology(
     best = _with_partners(best, views, targets, run, told)
     if best is given:
         return now
+    if targets is not own:
+        best = run.tried(best.tree, own)
     run.progress.follow(best.progress)
     return best.state
 

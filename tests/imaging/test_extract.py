@@ -13,12 +13,13 @@ from gcar_deploy.imaging.extract import (
     extract_vessels,
 )
 from gcar_deploy.imaging.polarity import with_polarity
-from gcar_deploy.imaging.resample import area_average, coarsened, resize, resized
+from gcar_deploy.imaging.resample import area_average, coarsened, coarser_view, resize, resized
 from gcar_deploy.imaging.widths import MASK_ERROR
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
 
 _OPTIONS = ImagingOptions()
+_PICTURES = ("path_mm", "mask", "skeleton", "device", "painted", "valid")
 
 
 def _dice(a, b):
@@ -256,6 +257,34 @@ def test_one_way_may_shrink_alone():
     means = picture.reshape(20, 3, 40).mean(axis=1)
     np.testing.assert_allclose(resize(picture, (40, 20)), means, atol=1e-6)
     np.testing.assert_allclose(resize(picture.T.copy(), (20, 40)), means.T, atol=1e-6)
+
+
+def test_a_border_more_leaves_a_coarser_view_as_it_was():
+    view = extract_vessels(angiogram(tube_paths() > 0.5, "mask"), _OPTIONS)
+    told = dataclasses.replace(view, device=view.path_mm / 9, painted=view.mask)
+    column, row = view.carm.principal_point
+
+    def wider(picture):
+        return np.pad(picture, ((7, 3), (5, 2)))
+
+    wide = dataclasses.replace(
+        told,
+        carm=dataclasses.replace(
+            view.carm, rows=view.carm.rows + 10, columns=view.carm.columns + 7,
+            principal_point_px=(column + 5, row + 7),
+        ),
+        **{name: wider(getattr(told, name)) for name in _PICTURES},
+    )  # fmt: skip
+    one, other = coarser_view(told, 2), coarser_view(wide, 2)
+    down, across = (
+        round(b - a) for a, b in zip(one.carm.principal_point[::-1],
+                                     other.carm.principal_point[::-1], strict=True)
+    )  # fmt: skip
+    assert one.mask.any() and one.carm.pixel_at_isocenter_mm > view.carm.pixel_at_isocenter_mm
+    for name in _PICTURES[:-1]:
+        a, b = getattr(one, name), getattr(other, name)
+        inner = b[down + 2 : down + a.shape[0] - 2, across + 2 : across + a.shape[1] - 2]
+        np.testing.assert_allclose(inner, a[2:-2, 2:-2], atol=1e-6, err_msg=name)
 
 
 def test_all_of_a_view_is_resized():

@@ -55,9 +55,9 @@ def test_no_tree_has_no_part():
     assert loose_mm(empty_tree()) == 0.0
 
 
-def _exchanged():
+def _exchanged(size=256, spacing=0.5):
     """Two like vessels side by side that cross the same planes, and with exchanged partners."""
-    carms = two_views()
+    carms = two_views(size, spacing)
     across = plane_normal(*carms)
     rays = [-one.source_mm / np.linalg.norm(one.source_mm) for one in carms]
     apart = 12.0 * (rays[0] + rays[1])
@@ -99,6 +99,34 @@ def test_vessels_with_exchanged_partners_hang_on_the_tree_again(monkeypatch):
     monkeypatch.setattr("gcar_deploy.tubes.topology.MOST_GIVEN_UP", 0.0)
     same = fit_tubes(start, views, TubeOptions(), evidence=told).tree
     assert same.points().tobytes() == left.points().tobytes()
+
+
+def test_trees_are_tried_on_coarser_pixels_and_fitted_to_the_finest(monkeypatch):
+    """Pixels of 0.11 mm are tried in pairs; what comes of it is as good."""
+    truth, ghosts, carms = _exchanged(1024, 0.16)
+    views = [
+        dataclasses.replace(view, skeleton=skeletonize(view.mask))
+        for view in seen(truth, carms, calibrated=False)
+    ]
+    where, both, shapes = grid(100), truth, []
+    for ghost in ghosts.branches[-2:]:
+        both = with_branch(both, ghost.points_mm, 1.0, 1.0, 0.5)
+    told = points_of(both, where)
+    told = dataclasses.replace(told, confidence=0.5 * told.confidence)
+    fit = Run.tried
+
+    def counted(run, tree, targets, *more):
+        shapes.append({target.path_mm.shape for target in targets})
+        return fit(run, tree, targets, *more)
+
+    monkeypatch.setattr(Run, "tried", counted)
+    found = fit_tubes(points_of(ghosts, where), views, TubeOptions(), evidence=told)
+    assert len(shapes) > 3
+    assert shapes[:-1] == [{(512, 512)}] * (len(shapes) - 1) and shapes[-1] == {(1024, 1024)}
+    assert {picture.shape for picture in found.model_mm} == {(1024, 1024)}
+    assert loose_mm(found.tree) == 0.0
+    assert cKDTree(truth.points()).query(found.tree.points())[0].max() < 1.5
+    assert cKDTree(found.tree.points()).query(truth.points())[0].max() < 1.5
 
 
 def _trials(monkeypatch, most_given_up):
