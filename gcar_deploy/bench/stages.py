@@ -129,6 +129,7 @@ def _cold(threads: int | None) -> dict[str, float]:
 def _process(arguments: list[str]) -> str:
     # The first run, which does not count, leaves the bytecode that an installation comes with.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    environment.setdefault("ORT_DISABLE_TELEMETRY", "1")  # ``LIBRARIES`` comes without gcar
     done = subprocess.run(  # noqa: S603 - our own interpreter and package
         [sys.executable, *arguments], capture_output=True, text=True, timeout=_MOST_S, check=False,
         env=environment,

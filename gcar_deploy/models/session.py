@@ -3,18 +3,39 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 
 from gcar_deploy.errors import CancelledError, ModelError, NumericalError
 from gcar_deploy.models.golden import check_golden
 from gcar_deploy.models.spec import ModelFile
 from gcar_deploy.types import Array
+
+
+@contextlib.contextmanager
+def _no_telemetry() -> Iterator[None]:
+    """Ask ONNX Runtime not to report; a user's own setting wins, the environment stays as it was.
+
+    It looks at this variable once, as it is loaded, and by then would have asked for a server's
+    address and written to the home folder.
+    """
+    key = "ORT_DISABLE_TELEMETRY"
+    told = key in os.environ
+    os.environ.setdefault(key, "1")
+    try:
+        yield
+    finally:
+        if not told:
+            os.environ.pop(key, None)
+
+
+with _no_telemetry():
+    import onnxruntime as ort
 
 #: how often a running inference is asked whether it should end, seconds
 WATCH_S = 0.02

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -197,3 +200,21 @@ def test_a_pinned_model_that_does_not_open_says_so_when_it_is_run():
 def test_a_folder_for_a_model_is_one_sentence():
     with pytest.raises(ModelError, match=r"model file \.: is not a regular file"):
         read_predictor(Path("."))
+
+
+@pytest.mark.parametrize(("told", "kept"), [(None, None), ("true", "true")])
+def test_the_runtime_reports_nothing_and_the_environment_stays(told, kept, tmp_path):
+    """A process of its own, with an empty home: it is as it was after a model ran."""
+    environment = {k: v for k, v in os.environ.items() if k != "ORT_DISABLE_TELEMETRY"}
+    environment["HOME"] = environment["XDG_CACHE_HOME"] = str(tmp_path)
+    if told is not None:
+        environment["ORT_DISABLE_TELEMETRY"] = told
+    code = (
+        "import os\nfrom gcar_deploy import Engine\nEngine(threads=1).warmup()\n"
+        "print(os.environ.get('ORT_DISABLE_TELEMETRY'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == str(kept)
+    assert not list(tmp_path.iterdir())
