@@ -2,20 +2,22 @@
 
 The surface becomes an Encapsulated STL (PS3.3 A.85), each overlay a Secondary Capture (A.8), the
 measurements a structured report (``dicom_sr``), a printed page an Encapsulated PDF (A.45). Who the
-patient is and which study it was are copied from the first run; nothing else is.
+patient is and which study it was are copied from the first run, as UTF-8; nothing else is. What
+pydicom and highdicom say of a value quotes it, so it stays in here.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import pydicom
-from pydicom.dataset import FileDataset, FileMetaDataset
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import (
     UID,
     EncapsulatedPDFStorage,
@@ -23,15 +25,17 @@ from pydicom.uid import (
     SecondaryCaptureImageStorage,
     generate_uid,
 )
+from pydicom.valuerep import DA, TM, PersonName
 
 from gcar_deploy.errors import GcarError, ImageError, UsageError
 from gcar_deploy.output.dicom_sr import measurement_report
 from gcar_deploy.output.dicom_stl import dicom_stl, equipment
 from gcar_deploy.output.stored import read_folder
 
-#: Patient and General Study modules (PS3.3 C.7.1.1, C.7.2.1), as far as they are told
-_COPIED = ("SpecificCharacterSet", "StudyInstanceUID", "StudyDescription")
-#: those of them that must stand in every object, empty where nobody knows (type 2)
+#: which study and which picture it is
+_UIDS = ("StudyInstanceUID", "SeriesInstanceUID", "SOPClassUID", "SOPInstanceUID")
+#: of the Patient and General Study modules (PS3.3 C.7.1.1, C.7.2.1) what must stand in every
+#: object, empty where nobody knows (type 2)
 _EMPTY = (
     "PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime",
     "ReferringPhysicianName", "StudyID", "AccessionNumber",
@@ -58,8 +62,20 @@ def study_objects(folder: Path, runs: Sequence[Path], pdf: Path | None = None) -
     ------
     GcarError
         A file cannot be read, the result was not made from these runs, they are of several
-        studies, or highdicom is missing.
+        studies, highdicom is missing, or it takes a value amiss.
     """
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            return _objects(folder, runs, pdf)
+    except (GcarError, MemoryError):
+        raise
+    except Exception as error:  # noqa: BLE001 - the libraries' errors share no base class
+        raise GcarError(
+            f"a value in the header of {runs[0].name} cannot be written ({type(error).__name__})"
+        ) from None
+
+
+def _objects(folder: Path, runs: Sequence[Path], pdf: Path | None) -> dict[str, Any]:
     stored = read_folder(folder)
     headers = [_header(run, stored.summary) for run in runs]
     if len(headers) != len(stored.summary["views"]):
@@ -77,7 +93,7 @@ def study_objects(folder: Path, runs: Sequence[Path], pdf: Path | None = None) -
     except OSError as error:
         raise GcarError(f"{error.filename} cannot be read ({error.strerror})") from None
     for data in made.values():
-        for keyword in (*_COPIED, *_EMPTY):
+        for keyword in ("SpecificCharacterSet", "StudyInstanceUID", "StudyDescription", *_EMPTY):
             if keyword in study:
                 setattr(data, keyword, study[keyword].value)
     made["measurements.dcm"] = measurement_report(
@@ -87,7 +103,7 @@ def study_objects(folder: Path, runs: Sequence[Path], pdf: Path | None = None) -
 
 
 def _header(run: Path, told: Mapping[str, Any]) -> Any:
-    """Header of a run that the result was made from: nobody else's study gets it."""
+    """Who and what a run is of that the result was made from: nobody else's study gets it."""
     try:
         data = run.read_bytes()
         found = pydicom.dcmread(io.BytesIO(data), stop_before_pixels=True)
@@ -96,19 +112,44 @@ def _header(run: Path, told: Mapping[str, Any]) -> Any:
     own = hashlib.sha256(data).hexdigest()
     if own not in {view["picture"]["sha256"] for view in told["views"]}:
         raise UsageError(f"{run} is none of the files that the result was made from")
-    missing = [k for k in ("StudyInstanceUID", "SOPClassUID", "SOPInstanceUID") if k not in found]
+    missing = [k for k in _UIDS if not found.get(k)]
     if missing:
         raise ImageError(f"{run} has no {missing[0]}: no object can be filed beside it")
+    out = Dataset()
+    # Not the file's own: what it holds may be no name of the standard, or have an empty first part.
+    out.SpecificCharacterSet = "ISO_IR 192"
+    for keyword in _UIDS:
+        setattr(out, keyword, str(found[keyword].value))
     for keyword in _EMPTY:
-        if keyword not in found:
-            setattr(found, keyword, "")
-    return found
+        setattr(out, keyword, _allowed(keyword, _text(found, keyword)))
+    if "StudyDescription" in found:
+        out.StudyDescription = _text(found, "StudyDescription")
+    return out
+
+
+def _text(data: Any, keyword: str) -> str:
+    value = data.get(keyword)
+    parts = [value] if value is None or isinstance(value, (str, PersonName)) else list(value)
+    return "\\".join("" if part is None else str(part) for part in parts)
+
+
+def _allowed(keyword: str, text: str) -> str:
+    """Return a value as the standard writes it (PS3.5 6.2), empty where it has no such."""
+    try:
+        if keyword.endswith("Date"):
+            return str(DA(text.replace(".", "")) or "")
+        if keyword.endswith("Time"):
+            return str(TM(text.replace(":", "")) or "")
+    except ValueError:
+        return ""
+    return text if keyword != "PatientSex" or text in ("M", "F", "O") else ""
 
 
 def file_bytes(data: Any) -> bytes:
     """Return a data set as the content of a DICOM file."""
     stream = io.BytesIO()
-    data.save_as(stream, enforce_file_format=True)
+    with warnings.catch_warnings(action="ignore"):
+        data.save_as(stream, enforce_file_format=True)
     return stream.getvalue()
 
 

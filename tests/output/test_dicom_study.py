@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 import subprocess
+import warnings
 
 import numpy as np
 import pytest
@@ -148,3 +151,68 @@ def test_captures_hold_the_overlays_pixels(result, jane):
     again = pydicom.dcmread(pydicom.filebase.DicomBytesIO(file_bytes(made["overlay_view2.dcm"])))
     shown = cv2.imread(str(result / "overlay_view2.png"), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(again.pixel_array, shown[..., ::-1])
+
+
+def as_stored(run, path, **changes):
+    """A copy of a run in which attributes stand as they are given, allowed or not."""
+    data = pydicom.dcmread(run)
+    data.SpecificCharacterSet = changes.pop("SpecificCharacterSet", None)
+    for key, value in changes.items():
+        setattr(data, key, value)
+    data.save_as(path)
+    return path
+
+
+def patient_of(changes, result, jane, tmp_path):
+    """Runs with other headers, and a result that says that it was made from them."""
+    runs = [as_stored(run, tmp_path / run.name, **changes) for run in jane]
+    folder = shutil.copytree(result, tmp_path / "result")
+    told = json.loads((folder / "result.json").read_text())
+    for view, run in zip(told["views"], runs, strict=True):
+        view["picture"]["sha256"] = hashlib.sha256(run.read_bytes()).hexdigest()
+    (folder / "result.json").write_text(json.dumps(told))
+    return folder, runs
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"SpecificCharacterSet": ["", "ISO 2022 IR 87"], "PatientName": "Yamada^Tarou=山田^太郎"},
+         {"PatientName": "Yamada^Tarou=山田^太郎"}),
+        ({"SpecificCharacterSet": "ISO_IR 100", "PatientName": "Müller^Jürgen"},
+         {"PatientName": "Müller^Jürgen"}),
+        ({"SpecificCharacterSet": "ISO-8859-1", "PatientID": "78"}, {"PatientID": "78"}),
+        ({"PatientSex": "D", "StudyTime": "10:10:10", "StudyDate": "2020.01.31"},
+         {"PatientSex": "", "StudyTime": "101010", "StudyDate": "20200131"}),
+        ({"StudyTime": "noon", "StudyDate": "20201399", "PatientBirthDate": "unknown"},
+         {"StudyTime": "", "StudyDate": "", "PatientBirthDate": ""}),
+        ({"PatientID": "P" * 80, "PatientComments": "tall"}, {"PatientID": "P" * 80}),
+    ],
+    ids=["kanji", "latin", "no-charset", "old-forms", "no-dates", "long"],
+)  # fmt: skip
+def test_headers_that_are_not_by_the_standard(changes, told, result, jane, tmp_path):
+    made = study_objects(*patient_of(changes, result, jane, tmp_path))
+    for data in made.values():
+        again = pydicom.dcmread(pydicom.filebase.DicomBytesIO(file_bytes(data)))
+        assert {key: str(again[key].value) for key in told} == told
+        assert again.SpecificCharacterSet == "ISO_IR 192" and "PatientComments" not in again
+
+
+def test_nothing_that_is_said_quotes_a_value(result, jane, tmp_path, monkeypatch, recwarn):
+    """highdicom warns of names without a caret, and its errors hold what they are about."""
+    changes = {"PatientName": "Schneider Anna", "PatientID": "P" * 80}
+    folder, runs = patient_of(changes, result, jane, tmp_path)
+    recwarn.clear()
+    warnings.simplefilter("error")
+    done = gcar("dicom", folder, *runs, "--out", tmp_path / "o")
+    assert done.code == 0 and "Schneider" not in done.out + done.err and not recwarn
+
+    def fails(*_):
+        raise ValueError("'Schneider Anna' is no name")
+
+    monkeypatch.setattr("gcar_deploy.output.dicom_study.measurement_report", fails)
+    done = gcar("dicom", folder, *runs, "--out", tmp_path / "p")
+    assert (done.code, done.err) == (
+        1, "gcar: error: a value in the header of run1.dcm cannot be written (ValueError)\n"
+    )  # fmt: skip
