@@ -91,7 +91,8 @@ def _objects(folder: Path, runs: Sequence[Path], pdf: Path | None) -> dict[str, 
         if pdf is not None:
             made["page.dcm"] = _page(pdf)
     except OSError as error:
-        raise GcarError(f"{error.filename} cannot be read ({error.strerror})") from None
+        lost = Path(error.filename or "a file").name
+        raise GcarError(f"{lost} cannot be read ({error.strerror})") from None
     for data in made.values():
         for keyword in ("SpecificCharacterSet", "StudyInstanceUID", "StudyDescription", *_EMPTY):
             if keyword in study:
@@ -108,13 +109,13 @@ def _header(run: Path, told: Mapping[str, Any]) -> Any:
         data = run.read_bytes()
         found = pydicom.dcmread(io.BytesIO(data), stop_before_pixels=True)
     except (OSError, pydicom.errors.InvalidDicomError):
-        raise ImageError(f"{run} cannot be read as DICOM") from None
+        raise ImageError(f"{run.name} cannot be read as DICOM") from None
     own = hashlib.sha256(data).hexdigest()
     if own not in {view["picture"]["sha256"] for view in told["views"]}:
-        raise UsageError(f"{run} is none of the files that the result was made from")
+        raise UsageError(f"{run.name} is none of the files that the result was made from")
     missing = [k for k in _UIDS if not found.get(k)]
     if missing:
-        raise ImageError(f"{run} has no {missing[0]}: no object can be filed beside it")
+        raise ImageError(f"{run.name} has no {missing[0]}: no object can be filed beside it")
     out = Dataset()
     # Not the file's own: what it holds may be no name of the standard, or have an empty first part.
     out.SpecificCharacterSet = "ISO_IR 192"
@@ -197,7 +198,7 @@ def _page(path: Path) -> Any:
     """Wrap a printed page as Encapsulated PDF."""
     content = path.read_bytes()
     if not content.startswith(b"%PDF-"):
-        raise GcarError(f"{path} is no PDF")
+        raise GcarError(f"{path.name} is no PDF")
     data = _new(EncapsulatedPDFStorage, "DOC", generate_uid(), 4)
     data.SeriesDescription = data.DocumentTitle = _PAGE
     # The page bears the name of its case, which may be a person's.

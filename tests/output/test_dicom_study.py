@@ -130,17 +130,17 @@ def test_a_validator_finds_no_fault(archive):
 
 def test_nobody_elses_study_gets_the_result(result, jane, tmp_path):
     _, others = named(tmp_path, side=240)
-    with pytest.raises(UsageError, match=r"run1\.dcm is none of the files that the result"):
+    with pytest.raises(UsageError, match=r"^run1\.dcm is none of the files that the result"):
         study_objects(result, [others[0], jane[1]])
     with pytest.raises(UsageError, match="1 runs: the result has 2"):
         study_objects(result, jane[:1])
     (tmp_path / "x.pdf").write_bytes(b"PDF")
-    with pytest.raises(GcarError, match=r"x\.pdf is no PDF"):
+    with pytest.raises(GcarError, match=r"^x\.pdf is no PDF"):
         study_objects(result, jane, tmp_path / "x.pdf")
-    with pytest.raises(GcarError, match=r"none\.pdf cannot be read"):
+    with pytest.raises(GcarError, match=r"^none\.pdf cannot be read"):
         study_objects(result, jane, tmp_path / "none.pdf")
     done = gcar("dicom", result, tmp_path / "none.dcm", jane[0], "--out", tmp_path / "o")
-    assert done.code == 3 and "none.dcm cannot be read as DICOM" in done.err
+    assert done.code == 3 and "error: none.dcm cannot be read as DICOM" in done.err
     assert not (tmp_path / "o").exists()
 
 
