@@ -149,8 +149,15 @@ def _run(arguments: list[str], verbose: bool) -> int:
         if verbose:
             logging.getLogger("gcar_deploy").exception("internal error")
         detail = str(error).splitlines()[0] if str(error) else ""
-        return _fail(f"internal error: {type(error).__name__} {detail}; see -v".strip(), INTERNAL)
+        hint = "; see -v" if _has_verbose(arguments) else ""
+        return _fail(f"internal error: {type(error).__name__} {detail}".strip() + hint, INTERNAL)
     return out if isinstance(out, int) else 0
+
+
+def _has_verbose(arguments: list[str]) -> bool:
+    """Whether the verb says more with ``-v``."""
+    verb = gcar.get_command(click.Context(gcar), arguments[0] if arguments else "")
+    return verb is not None and any("-v" in option.opts for option in verb.params)
 
 
 def _stopped(error: BaseException | None) -> tuple[str, int] | None:

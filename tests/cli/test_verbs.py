@@ -300,9 +300,12 @@ def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monke
     monkeypatch.setattr(engine, "reconstruct", broken)
     done = gcar(*run_arguments(good_case, tmp_path / "out"))
     assert done.code == 1 and len(done.err.splitlines()) == 1 and "Traceback" not in done.err
-    assert done.err.startswith("gcar: error: internal error: ZeroDivisionError")
+    assert done.err == "gcar: error: internal error: ZeroDivisionError division; see -v\n"
     assert "Traceback" in gcar(*run_arguments(good_case, tmp_path / "out", "-v")).err
     assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr("gcar_deploy.output.folder.check_target", broken)
+    verb = ("dicom", tmp_path, tmp_path / "a.dcm", "--out", tmp_path / "o")
+    assert gcar(*verb).err == "gcar: error: internal error: ZeroDivisionError division\n"  # no -v
 
 
 @pytest.mark.slow
