@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from gcar_deploy.predict import Predictor, load_predictor, missing_predictor
 from gcar_deploy.reconstruct import reconstruct
 from gcar_deploy.result import Result
 from gcar_deploy.steps import OnStep
-from gcar_deploy.stopwatch import OnProgress
+from gcar_deploy.stopwatch import OnProgress, Stopwatch
 
 _NO_FOLDER = "out is missing: name the folder for the result (--out DIR)"
 
@@ -135,7 +134,8 @@ class Engine:
         deadline_s : seconds that the call may take: the refinement ends early enough with what
             it has (``degraded``); CancelledError if there is nothing to refine by then
         cancel : callable, for instance ``threading.Event().is_set``; also asked from another
-            thread while the model runs; ends within one step of the refinement
+            thread while the model runs; ends within one frame that is read, or one step of the
+            refinement
         on_step : told what each stage hands on, for instance ``output.steps.StepFolder``
 
         Raises
@@ -184,12 +184,12 @@ class Engine:
         cancel: Callable[[], bool] | None,
         on_step: OnStep | None,
     ) -> Result:
-        started = time.perf_counter()
+        watch = Stopwatch((), deadline_s=task.deadline_s, cancel=cancel)
         options = task.options
         check_options(options)
         predictor, missing = self._predictor_for(options.predict)
         angiograms, grid, notes = prepare(
-            task.views, task.geometry, options, task.masks, task.drawn
+            task.views, task.geometry, options, task.masks, task.drawn, watch.check
         )
         wanted = options.imaging.segmenter if asks_network(angiograms) else "classic"
         with allowed_threads(self.threads):
@@ -202,7 +202,7 @@ class Engine:
                 on_progress=on_progress,
                 deadline_s=task.deadline_s,
                 cancel=cancel,
-                used_s=time.perf_counter() - started,
+                used_s=watch.elapsed_s,
                 on_step=on_step,
             )
         return Result.of(found, (*notes, *missing, *found.notes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from io import BytesIO
 from typing import Any
 
@@ -22,6 +23,7 @@ class Frames:
     Parameters
     ----------
     header : Header
+    check : called before each frame is decoded; what it raises ends the reading
 
     Raises
     ------
@@ -29,11 +31,11 @@ class Frames:
         There are no pixels, or fewer than the header promises.
     """
 
-    def __init__(self, header: Header) -> None:
+    def __init__(self, header: Header, check: Callable[[], None] | None = None) -> None:
         import pydicom
         from pydicom.pixels import get_decoder
 
-        self.header = header
+        self.header, self._check = header, check
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -68,6 +70,8 @@ class Frames:
         ImageError
             The frame is damaged or of another size than the header says.
         """
+        if self._check is not None:
+            self._check()
         header = self.header
         stored = int(self._dataset.BitsStored)
         try:

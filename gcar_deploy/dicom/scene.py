@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,20 +49,24 @@ class Run:
 
 
 def read_run(
-    path: str | Path, options: DicomOptions, wanted: int | ChosenFrame | None = None
+    path: str | Path,
+    options: DicomOptions,
+    wanted: int | ChosenFrame | None = None,
+    check: Callable[[], None] | None = None,
 ) -> Run:
     """Read a run and choose its frame.
 
     Parameters
     ----------
     wanted : from 1, None to choose, or what was chosen already
+    check : called before each frame is read; what it raises ends the reading
 
     Raises
     ------
     ImageError, UsageError, GeometryError
     """
     header = read_header(path, options.limits)
-    frames = Frames(header)
+    frames = Frames(header, check)
     if isinstance(wanted, ChosenFrame):
         chosen: ChosenFrame | None = wanted
         choice = Choice(index=wanted.number - 1, reason=wanted.reason)
@@ -90,6 +94,7 @@ def read_views(
     paths: Sequence[str | Path],
     options: DicomOptions,
     chosen: Mapping[int, ChosenFrame] | None = None,
+    check: Callable[[], None] | None = None,
 ) -> tuple[list[Angiogram], Scene, list[str]]:
     """Read runs whose headers tell the whole geometry.
 
@@ -98,6 +103,7 @@ def read_views(
     paths : two or more files
     options : DicomOptions; ``frames`` has one entry, or one for each file
     chosen : number of the view, from 1 -> its frame, where that was chosen already
+    check : as ``read_run``
 
     Returns
     -------
@@ -110,7 +116,7 @@ def read_views(
     wanted = wanted_frames(options, len(paths))
     angiograms, views, notes = [], [], []
     for number, (path, frame) in enumerate(zip(paths, wanted, strict=True), start=1):
-        run = read_run(path, options, (chosen or {}).get(number, frame))
+        run = read_run(path, options, (chosen or {}).get(number, frame), check)
         carm, said = frame_carm(run.header, run.index, options)
         # By number: a result must not carry the name of a file, which may be the patient's.
         notes += [f"view {number}: {note}" for note in (*run.notes, *said)]

@@ -71,13 +71,20 @@ def is_cine(path: str | Path) -> bool:
     return Path(path).is_dir() or is_stack(path)
 
 
-def open_cine(path: str | Path, options: RunOptions, *, subtracted: bool = False) -> Cine | None:
+def open_cine(
+    path: str | Path,
+    options: RunOptions,
+    *,
+    subtracted: bool = False,
+    check: Callable[[], None] | None = None,
+) -> Cine | None:
     """Open a run; None for a single picture.
 
     Parameters
     ----------
     path : of a file or a folder of pictures
     subtracted : as ``imaging.read.read_picture``
+    check : called before each frame is read; what it raises ends the reading
 
     Raises
     ------
@@ -85,10 +92,20 @@ def open_cine(path: str | Path, options: RunOptions, *, subtracted: bool = False
     """
     path = Path(path)
     if path.is_dir():
-        return _of_folder(path, options, subtracted)
-    if is_dicom(path):
-        return _of_dicom(path, options)
-    return _of_stack(path, options, subtracted) if is_stack(path) else None
+        cine: Cine | None = _of_folder(path, options, subtracted)
+    elif is_dicom(path):
+        cine = _of_dicom(path, options)
+    else:
+        cine = _of_stack(path, options, subtracted) if is_stack(path) else None
+    if cine is None or check is None:
+        return cine
+    own = cine.read
+
+    def read(index: int) -> tuple[Image, int, str]:
+        check()
+        return own(index)
+
+    return dataclasses.replace(cine, read=read)
 
 
 def _of_dicom(path: Path, options: RunOptions) -> Cine | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -39,6 +39,7 @@ def prepare(
     options: RunOptions,
     masks: Mapping[int, Mask] | None = None,
     drawn: Mapping[int, Drawn] | None = None,
+    check: Callable[[], None] | None = None,
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pair pictures with their views.
 
@@ -49,6 +50,7 @@ def prepare(
     options : RunOptions, of which ``dicom`` and ``imaging`` are used
     masks : number of the view, from 1 -> vessel mask (picture of its size)
     drawn : number of the view -> strokes and region of interest
+    check : called before each frame of a run is read; what it raises ends the reading
 
     Returns
     -------
@@ -65,11 +67,11 @@ def prepare(
     """
     _check_kinds(views)
     if geometry is None:
-        angiograms, grid, notes = _from_headers(views, options)
+        angiograms, grid, notes = _from_headers(views, options, check)
     elif isinstance(geometry, Grid):
         angiograms, grid, notes = _in_memory(views), geometry, []
     else:
-        angiograms, grid, notes = _by_scene(views, _scene(geometry), options)
+        angiograms, grid, notes = _by_scene(views, _scene(geometry), options, check)
     angiograms = [
         dataclasses.replace(one, file=Path(view).name) if isinstance(view, (str, Path)) else one
         for one, view in zip(angiograms, views, strict=True)
@@ -160,7 +162,10 @@ def _in_memory(views: Sequence[Picture]) -> list[Angiogram]:
 
 
 def _by_scene(
-    views: Sequence[Picture], scene: Scene, options: RunOptions
+    views: Sequence[Picture],
+    scene: Scene,
+    options: RunOptions,
+    check: Callable[[], None] | None,
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pictures of any kind, each with the view of its place."""
     if len(scene.views) != len(views):
@@ -168,7 +173,7 @@ def _by_scene(
             f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
         )
     angiograms = []
-    runs = find_runs(views, options, scene)
+    runs = find_runs(views, options, scene, check)
     notes = [*scene.warnings, *_unused(options.dicom, any_run=bool(runs.wanted))]
     seen = seen_runs(runs, scene, options)
     chosen = together(runs, seen)
@@ -176,7 +181,8 @@ def _by_scene(
         if isinstance(picture, Angiogram):
             angiograms.append(picture)
         elif isinstance(picture, (str, Path)) and is_dicom(picture):
-            run = read_run(picture, options.dicom, chosen.get(number, runs.wanted[number]))
+            frame = chosen.get(number, runs.wanted[number])
+            run = read_run(picture, options.dicom, frame, check)
             carm = _matched(view, run.pixels.shape, options.imaging, notes, picture)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
             notes += [f"view {view.id}: {note}" for note in run.notes]
@@ -226,7 +232,7 @@ def _as_angiogram(
 
 
 def _from_headers(
-    views: Sequence[Picture], options: RunOptions
+    views: Sequence[Picture], options: RunOptions, check: Callable[[], None] | None
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pictures whose own headers tell the geometry: DICOM XA alone."""
     paths = [view for view in views if isinstance(view, (str, Path))]
@@ -242,9 +248,9 @@ def _from_headers(
             )
     if len(paths) != len(views):
         raise UsageError("pictures in memory tell no geometry: give a scene")
-    runs = find_runs(paths, options)
+    runs = find_runs(paths, options, check=check)
     seen = seen_runs(runs, None, options)
-    angiograms, scene, notes = read_views(paths, options.dicom, together(runs, seen))
+    angiograms, scene, notes = read_views(paths, options.dicom, together(runs, seen), check)
     angiograms, more = with_bare(angiograms, runs, seen)
     return angiograms, scene.volume_grid(), notes + more
 

@@ -12,7 +12,7 @@ from gcar_deploy.dicom.carm import frame_carm
 from gcar_deploy.dicom.choose import choose_frame
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import intensity_of, wanted_frames
-from gcar_deploy.errors import GcarError, GeometryError, UsageError
+from gcar_deploy.errors import CancelledError, GcarError, GeometryError, UsageError
 from gcar_deploy.frames.bare import bare_before
 from gcar_deploy.frames.choose import SeenRun, choose_frames, masses_of, pair_of, stands_still
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
@@ -60,7 +60,12 @@ class Runs:
         return (*cine.read(frame.number - 1), frame)
 
 
-def find_runs(views: Sequence[Any], options: RunOptions, scene: Scene | None = None) -> Runs:
+def find_runs(
+    views: Sequence[Any],
+    options: RunOptions,
+    scene: Scene | None = None,
+    check: Callable[[], None] | None = None,
+) -> Runs:
     """Find the runs among the views, and what is asked of them.
 
     Parameters
@@ -68,6 +73,7 @@ def find_runs(views: Sequence[Any], options: RunOptions, scene: Scene | None = N
     views : files, or pictures in memory
     options : RunOptions
     scene : what the views' counts mean, a view each; None where headers tell it
+    check : called before each frame is read; what it raises ends the reading
 
     Raises
     ------
@@ -78,7 +84,7 @@ def find_runs(views: Sequence[Any], options: RunOptions, scene: Scene | None = N
     wanted = dict(zip(runs, wanted_frames(options.dicom, len(runs)), strict=True)) if runs else {}
     opened = {
         k: open_cine(
-            files[k], options,
+            files[k], options, check=check,
             subtracted=scene is not None and scene.views[k - 1].intensity.subtracted,
         )
         for k in runs
@@ -130,6 +136,8 @@ def seen_runs(runs: Runs, scene: Scene | None, options: RunOptions) -> dict[int,
     for k, cine in runs.cines.items():
         try:
             found = _seen(k, cine, scene, options)
+        except CancelledError:
+            raise
         except GcarError:
             continue  # whoever reads the frame that is taken says what is wrong
         if found is not None:

@@ -1,5 +1,7 @@
 """Frame choice, shutters, meaning of the grey values, warnings."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -8,9 +10,12 @@ pytest.importorskip("pydicom", reason="needs the dicom extra")
 from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
-from gcar_deploy.config import DicomOptions
-from gcar_deploy.dicom.scene import read_run
-from gcar_deploy.errors import UsageError
+from gcar_deploy.config import DicomOptions, PredictOptions, RunOptions
+from gcar_deploy.dicom.frames import Frames
+from gcar_deploy.dicom.scene import read_run, read_views
+from gcar_deploy.engine import Engine
+from gcar_deploy.errors import CancelledError, UsageError
+from gcar_deploy.geometry.scene import scene_to_json
 from tests.dicom.files import classic, enhanced, save, vessel_frames
 
 OPTIONS = DicomOptions()
@@ -143,3 +148,25 @@ def test_meaning_of_the_grey_values(run, changes, kind, polarity):
 def test_said_aloud(run, changes, words):
     assert any(words in note and "a.dcm" not in note for note in run(**changes).notes)
     assert run().notes == ()
+
+
+@pytest.mark.parametrize("by", ["headers", "scene"])
+@pytest.mark.parametrize("side", [1, 2])
+def test_reading_a_run_ends_with_the_call(by, side, tmp_path, monkeypatch):
+    """Two runs that choose together, and one that chooses alone beside a single picture."""
+    runs = [
+        save(classic(vessel_frames(k, 6), PositionerPrimaryAngle=angle), tmp_path / f"{angle}.dcm")
+        for k, angle in ((40, "-30"), (40 if side == 2 else 1, "45"))
+    ]
+    geometry = None
+    if by == "scene":
+        geometry = json.loads(scene_to_json(read_views(runs, DicomOptions(frames=(1,)))[1]))
+    decoded, decode = [], Frames.decode
+    monkeypatch.setattr(Frames, "decode", lambda *a: (decode(*a), decoded.append(a))[0])
+    engine = Engine(threads=1, options=RunOptions(predict=PredictOptions(predictor="none")))
+    with pytest.raises(CancelledError, match="cancelled by the caller"):
+        engine.reconstruct(runs, geometry, cancel=lambda: len(decoded) >= 5)
+    assert len(decoded) <= 6
+    with pytest.raises(CancelledError, match="deadline"):
+        engine.reconstruct(runs, geometry, deadline_s=1e-4)
+    assert len(decoded) <= 8
