@@ -42,7 +42,7 @@ def frame_carm(header: Header, frame: int, options: DicomOptions) -> tuple[CArm,
     """
     try:
         notes: list[str] = []
-        primary, secondary = _angles(header, frame)
+        primary, secondary = _angles(header, frame, notes)
         sod, sdd = _distances(header, frame, options, notes)
         spacing = _spacing(header, frame, options, notes)
         _check_tilt(header, frame, notes)
@@ -71,7 +71,7 @@ def is_flipped(header: Header, frame: int) -> bool:
     return header.text("FieldOfViewHorizontalFlip", frame) == "YES"
 
 
-def _angles(header: Header, frame: int) -> tuple[float, float]:
+def _angles(header: Header, frame: int, notes: list[str]) -> tuple[float, float]:
     found = []
     for axis in ("Primary", "Secondary"):
         keyword = f"Positioner{axis}Angle"
@@ -80,21 +80,29 @@ def _angles(header: Header, frame: int) -> tuple[float, float]:
             angle = header.number(f"PositionerIsocenter{axis}Angle", frame)
         if angle is None:
             raise GeometryError(f"{tag(keyword)} is missing; {_WAY_OUT}")
-        found.append(angle + (0.0 if header.enhanced else _increment(header, keyword, frame)))
+        if not header.enhanced:
+            angle += _increment(header, keyword, frame, notes)
+        found.append(angle)
     # Sums of angle and increment may pass the back; the direction is the same.
     primary = found[0] if abs(found[0]) <= 180.0 else (found[0] + 180.0) % 360.0 - 180.0
     return primary, found[1]
 
 
-def _increment(header: Header, keyword: str, frame: int) -> float:
+def _increment(header: Header, keyword: str, frame: int, notes: list[str]) -> float:
     """Angle of a frame against the first (PS3.3 C.8.7.5.1.3).
 
-    One value is the change from frame to frame, as many as frames are offsets from the first.
+    One value is the change from frame to frame, as many as frames are offsets from the first. They
+    mean something in dynamic runs alone, but not every file says that its run is one.
     """
-    if header.text("PositionerMotion") != "DYNAMIC":
+    motion, steps = header.text("PositionerMotion"), header.numbers(keyword + "Increment")
+    if motion == "STATIC":
+        if steps is not None and any(steps):
+            notes.append(
+                f"{tag(keyword + 'Increment')} is not used: {tag('PositionerMotion')} = STATIC, "
+                "the C-arm stood still"
+            )
         return 0.0
-    steps = header.numbers(keyword + "Increment")
-    if steps is None and frame == 0:
+    if steps is None and (frame == 0 or motion != "DYNAMIC"):
         return 0.0
     if steps is None:
         raise GeometryError(

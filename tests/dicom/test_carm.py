@@ -108,7 +108,14 @@ def test_dynamic_run(carm):
     still = {"PositionerMotion": "STATIC", "PositionerPrimaryAngleIncrement": "2"}
     moving = {"PositionerMotion": "DYNAMIC", "PositionerSecondaryAngleIncrement": "0"}
     frames = vessel_frames(4)
-    assert carm(3, pixels=frames, **still)[0].primary_angle_deg == 30
+    view, notes = carm(3, pixels=frames, **still)
+    assert view.primary_angle_deg == 30 and "PositionerPrimaryAngleIncrement" in notes[0]
+    assert carm(3, pixels=frames, **{**still, "PositionerPrimaryAngleIncrement": "0"})[1] == []
+    # A file that does not say whether the C-arm moved tells it by its increments.
+    for silent in ({}, {"PositionerMotion": ""}):
+        view, _ = carm(3, pixels=frames, **silent, PositionerPrimaryAngleIncrement="2.5")
+        assert view.primary_angle_deg == 37.5
+        assert carm(3, pixels=frames, **silent)[0].primary_angle_deg == 30
     # One value: change per frame.
     view, _ = carm(3, pixels=frames, **moving, PositionerPrimaryAngleIncrement="2.5")
     assert view.primary_angle_deg == 37.5
