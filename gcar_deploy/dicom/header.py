@@ -35,6 +35,8 @@ SYNTAXES = {
     "1.2.840.10008.1.2.4.90": False,  # JPEG 2000
     "1.2.840.10008.1.2.4.91": True,
 }
+#: who the patient is; names are spelt in too many ways
+PATIENT = ("PatientID", "PatientBirthDate", "PatientSex")
 _DEFLATED = b"1.2.840.10008.1.2.1.99"
 
 

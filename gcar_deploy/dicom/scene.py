@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +14,9 @@ from gcar_deploy.config import DicomOptions
 from gcar_deploy.dicom.carm import frame_carm, is_flipped
 from gcar_deploy.dicom.choose import Choice, choose_frame
 from gcar_deploy.dicom.frames import Frames
-from gcar_deploy.dicom.header import SYNTAXES, Header, read_header, tag
+from gcar_deploy.dicom.header import PATIENT, SYNTAXES, Header, read_header, tag
 from gcar_deploy.dicom.shutter import open_field
-from gcar_deploy.errors import UsageError
+from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.frame import ChosenFrame
@@ -114,7 +115,7 @@ def read_views(
     ImageError, GeometryError, UsageError
     """
     wanted = wanted_frames(options, len(paths))
-    angiograms, views, notes = [], [], []
+    angiograms, views, notes, headers = [], [], [], {}
     for number, (path, frame) in enumerate(zip(paths, wanted, strict=True), start=1):
         run = read_run(path, options, (chosen or {}).get(number, frame), check)
         carm, said = frame_carm(run.header, run.index, options)
@@ -123,9 +124,49 @@ def read_views(
         view = View(id=str(number), carm=carm, intensity=run.intensity)
         views.append(view)
         angiograms.append(as_angiogram(run, view))
+        headers[number] = run.header
+    notes += with_origin(angiograms, headers)
     # The one set of checks that every scene passes, whatever it was written in.
     scene = parse_scene(scene_to_json(Scene(views=tuple(views))), "the geometry in the headers")
     return angiograms, scene, [*notes, *scene.warnings]
+
+
+def with_origin(angiograms: list[Angiogram], headers: Mapping[int, Header]) -> list[str]:
+    """Hold against each other whom the runs show: a doubt where these are different patients.
+
+    Parameters
+    ----------
+    angiograms : of all views; the doubt is put to that of the later run
+    headers : number of the view, from 1 -> its header; values of it are not repeated
+
+    Returns
+    -------
+    notes : of runs of one patient, whether they are of different studies
+    """
+    notes = []
+    for a, b in itertools.combinations(sorted(headers), 2):
+        one, other = (
+            {key: _text(headers[k], key) for key in (*PATIENT, "StudyInstanceUID")} for k in (a, b)
+        )
+        differ = [key for key in one if one[key] and other[key] and one[key] != other[key]]
+        patient = [key for key in differ if key in PATIENT]
+        if patient:
+            doubt = (
+                f"the headers of views {a} and {b} tell of different patients "
+                f"({', '.join(map(tag, patient))})"
+            )
+            seen = angiograms[b - 1]
+            angiograms[b - 1] = dataclasses.replace(seen, doubts=(*seen.doubts, doubt))
+        elif differ:
+            notes.append(f"views {a} and {b} are of different studies")
+    return notes
+
+
+def _text(header: Header, keyword: str) -> str:
+    try:
+        return header.text(keyword)
+    except GeometryError:
+        return ""  # damaged: it tells nothing
 
 
 def as_angiogram(run: Run, view: View) -> Angiogram:

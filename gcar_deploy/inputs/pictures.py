@@ -13,7 +13,7 @@ import numpy as np
 
 from gcar_deploy.config import DicomOptions, ImagingOptions, PictureLimits, RunOptions
 from gcar_deploy.dicom.header import is_dicom
-from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views
+from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, with_origin
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
@@ -172,7 +172,7 @@ def _by_scene(
         raise GeometryError(
             f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
         )
-    angiograms = []
+    angiograms, headers = [], {}
     runs = find_runs(views, options, scene, check)
     notes = [*scene.warnings, *_unused(options.dicom, any_run=bool(runs.wanted))]
     seen = seen_runs(runs, scene, options)
@@ -185,6 +185,7 @@ def _by_scene(
             run = read_run(picture, options.dicom, frame, check)
             carm = _matched(view, run.pixels.shape, options.imaging, notes, picture)
             angiograms.append(as_angiogram(run, dataclasses.replace(view, carm=carm)))
+            headers[number] = run.header
             notes += [f"view {view.id}: {note}" for note in run.notes]
         elif number in runs.cines:
             *read, frame = runs.frame(number, chosen)
@@ -194,6 +195,7 @@ def _by_scene(
                 notes.append(f"view {view.id}: frame {frame.number} of {frame.of}: {frame.reason}")
         else:
             angiograms.append(_angiogram(picture, view, options.imaging, notes))
+    notes += with_origin(angiograms, headers)
     angiograms, more = with_bare(angiograms, runs, seen)
     return angiograms, scene.volume_grid(), notes + more
 

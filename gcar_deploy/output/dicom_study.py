@@ -27,6 +27,7 @@ from pydicom.uid import (
 )
 from pydicom.valuerep import DA, TM, PersonName
 
+from gcar_deploy.dicom.header import PATIENT
 from gcar_deploy.errors import GcarError, ImageError, UsageError
 from gcar_deploy.output.dicom_sr import measurement_report
 from gcar_deploy.output.dicom_stl import dicom_stl, equipment
@@ -80,6 +81,11 @@ def _objects(folder: Path, runs: Sequence[Path], pdf: Path | None) -> dict[str, 
     headers = [_header(run, stored.summary) for run in runs]
     if len(headers) != len(stored.summary["views"]):
         raise UsageError(f"{len(headers)} runs: the result has {len(stored.summary['views'])}")
+    for keyword in PATIENT:
+        if len({str(header[keyword].value).strip().upper() for header in headers} - {""}) > 1:
+            raise UsageError(
+                f"the runs tell of different patients ({keyword}): the result belongs to neither"
+            )
     study = headers[0]
     try:
         surface = dicom_stl((folder / "surface.stl").read_bytes(), [str(study.StudyInstanceUID)])

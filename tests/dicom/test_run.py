@@ -16,6 +16,8 @@ from gcar_deploy.dicom.scene import read_run, read_views
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import CancelledError, UsageError
 from gcar_deploy.geometry.scene import scene_to_json
+from gcar_deploy.inputs.pictures import prepare
+from gcar_deploy.quality import check_views
 from tests.dicom.files import classic, enhanced, save, vessel_frames
 
 OPTIONS = DicomOptions()
@@ -170,3 +172,39 @@ def test_reading_a_run_ends_with_the_call(by, side, tmp_path, monkeypatch):
     with pytest.raises(CancelledError, match="deadline"):
         engine.reconstruct(runs, geometry, deadline_s=1e-4)
     assert len(decoded) <= 8
+
+
+def pair_of(folder, *told):
+    """Two runs that show two things; a header each."""
+    pictures = vessel_frames(), np.swapaxes(vessel_frames(), 1, 2)
+    return [
+        save(classic(pixels, PositionerPrimaryAngle=angle, **one), folder / f"{angle}.dcm")
+        for pixels, angle, one in zip(pictures, ("-30", "45"), told, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("own", "others", "said"),
+    [
+        ({"PatientID": "ZZ1"}, {"PatientID": "ZZ2"}, "(PatientID (0010,0020))"),
+        ({"PatientSex": "F"}, {"PatientSex": "M"}, "(PatientSex (0010,0040))"),
+        ({"PatientBirthDate": "19010203"}, {"PatientBirthDate": "19010204"}, "BirthDate"),
+        ({"PatientID": "ZZ1"}, {"PatientID": " zz1", "PatientSex": "M"}, None),
+        ({"PatientName": "ZZ^A"}, {"PatientName": "ZZ^B"}, None),
+    ],
+)
+def test_runs_of_different_patients_are_a_finding(own, others, said, tmp_path):
+    runs = pair_of(tmp_path, own, others)
+    angiograms, scene, notes = read_views(runs, OPTIONS)
+    by_scene, _, _ = prepare(runs, json.loads(scene_to_json(scene)), RunOptions())
+    for views in (angiograms, by_scene):
+        findings = check_views(views, RunOptions().quality)
+        assert findings == [] if said is None else said in findings[0]
+        assert not any("ZZ" in text or "1901" in text for text in (*findings, *notes))
+
+
+def test_different_studies_of_one_patient_are_said(tmp_path):
+    runs = pair_of(tmp_path, *({"PatientID": "1", "StudyInstanceUID": f"1.2.{k}"} for k in "12"))
+    angiograms, _, notes = read_views(runs, OPTIONS)
+    assert "views 1 and 2 are of different studies" in notes
+    assert not check_views(angiograms, RunOptions().quality)

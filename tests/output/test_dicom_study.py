@@ -163,15 +163,23 @@ def as_stored(run, path, **changes):
     return path
 
 
-def patient_of(changes, result, jane, tmp_path):
+def patient_of(changes, result, jane, tmp_path, others=None):
     """Runs with other headers, and a result that says that it was made from them."""
-    runs = [as_stored(run, tmp_path / run.name, **changes) for run in jane]
+    told = changes, changes if others is None else others
+    runs = [as_stored(run, tmp_path / run.name, **one) for run, one in zip(jane, told, strict=True)]
     folder = shutil.copytree(result, tmp_path / "result")
-    told = json.loads((folder / "result.json").read_text())
-    for view, run in zip(told["views"], runs, strict=True):
+    summary = json.loads((folder / "result.json").read_text())
+    for view, run in zip(summary["views"], runs, strict=True):
         view["picture"]["sha256"] = hashlib.sha256(run.read_bytes()).hexdigest()
-    (folder / "result.json").write_text(json.dumps(told))
+    (folder / "result.json").write_text(json.dumps(summary))
     return folder, runs
+
+
+def test_runs_of_two_patients_are_filed_for_neither(result, jane, tmp_path):
+    made = patient_of({"PatientID": "77"}, result, jane, tmp_path, {"PatientID": "4711"})
+    with pytest.raises(UsageError, match="different patients") as refused:
+        study_objects(*made)
+    assert "PatientID" in str(refused.value) and "77" not in str(refused.value)
 
 
 @pytest.mark.filterwarnings("ignore")
