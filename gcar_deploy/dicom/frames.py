@@ -74,12 +74,17 @@ class Frames:
             self._check()
         header = self.header
         stored = int(self._dataset.BitsStored)
+        high = self._dataset.get("HighBit")
+        above = 0 if high is None else int(high) + 1 - stored
         try:
             if self._packed:
                 self._check_stream(index)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                pixels, _ = self._decoder.as_array(self._dataset, index=index, raw=True)
+                # Its own correction of unused bits cuts at the top, whatever HighBit says.
+                pixels, _ = self._decoder.as_array(
+                    self._dataset, index=index, raw=True, correct_unused_bits=False
+                )
             pixels = np.asarray(pixels).astype(np.int64)
         except ImageError:
             raise
@@ -89,8 +94,8 @@ class Frames:
             ) from None
         if pixels.shape != (header.rows, header.columns):
             raise ImageError(f"{header.name}: frame {index + 1} has another size than its header")
-        # Bits above those stored may hold an overlay.
-        pixels &= (1 << stored) - 1
+        # Bits above those stored, and below them, may hold an overlay.
+        pixels = (pixels >> above) & ((1 << stored) - 1)
         if header.text("PhotometricInterpretation") == "MONOCHROME1":
             pixels = (1 << stored) - 1 - pixels
         return pixels.astype(np.float32)

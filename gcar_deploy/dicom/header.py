@@ -35,6 +35,13 @@ SYNTAXES = {
     "1.2.840.10008.1.2.4.90": False,  # JPEG 2000
     "1.2.840.10008.1.2.4.91": True,
 }
+_JPEG = "1.2.840.10008.1.2.4."
+#: what a decoder must be told of the pixels
+_COUNTS = (
+    "Rows", "Columns", "BitsAllocated", "BitsStored", "SamplesPerPixel", "PixelRepresentation",
+)  # fmt: skip
+_NEEDED = (*_COUNTS, "PhotometricInterpretation")
+_GREY = ("MONOCHROME1", "MONOCHROME2")
 #: who the patient is; names are spelt in too many ways
 PATIENT = ("PatientID", "PatientBirthDate", "PatientSex")
 _DEFLATED = b"1.2.840.10008.1.2.1.99"
@@ -191,23 +198,35 @@ def _header(name: str, data: bytes, limits: DicomLimits) -> Header:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # values are checked where they are used
-            dataset = pydicom.dcmread(BytesIO(data), stop_before_pixels=True)
+            stream = BytesIO(data)
+            dataset = pydicom.dcmread(stream, stop_before_pixels=True)
             syntax = str(dataset.file_meta.TransferSyntaxUID)
             kind = str(dataset.get("SOPClassUID", "")) or "nothing"
-            size = {k: dataset.get(k) for k in ("Rows", "Columns", "BitsAllocated", "BitsStored")}
+            missing = [k for k in _NEEDED if dataset.get(k) in (None, "")]
             frames = int(dataset.get("NumberOfFrames") or 1)
-            rows, columns, bits, stored = (int(value or 0) for value in size.values())
-            samples = int(dataset.get("SamplesPerPixel") or 1)
-            signed = int(dataset.get("PixelRepresentation") or 0)
+            counts = (int(dataset.get(k) or 0) for k in _COUNTS)
+            rows, columns, bits, stored, samples, signed = counts
+            high = dataset.get("HighBit")
+            high = stored - 1 if high is None else int(high)
+            grey = str(dataset.get("PhotometricInterpretation")).strip().upper()
     except Exception:  # noqa: BLE001 - pydicom's errors share no base class
         raise ValueError("has a damaged header; export it again") from None
+    if stream.tell() >= len(data) and (kind == "nothing" or ENHANCED.startswith(kind)):
+        raise ValueError("ends before its pixels (truncated); copy or export it again")
     if kind not in (CLASSIC, ENHANCED):
         raise ValueError(f"holds {_kind_name(kind)}; X-ray angiography (XA) is needed")
     if syntax not in SYNTAXES:
         raise ValueError(f"is encoded as {_kind_name(syntax)}, which is not supported")
+    if missing:
+        raise ValueError(f"has no {tag(missing[0])}; export it again")
     _check_size(rows, columns, frames, bits, limits)
-    if samples != 1 or signed or not 1 <= stored <= bits:
+    if samples != 1 or signed or not 1 <= stored <= bits or grey not in _GREY:
         raise ValueError("holds colour or signed pixels; XA is unsigned grey")
+    # Compressed streams hold whole cells of their own depth: where the bits lie is not for sure.
+    if not stored <= high + 1 <= (stored if syntax.startswith(_JPEG) else bits):
+        raise ValueError(
+            f"has {tag('HighBit')} = {high}; for {stored} bits stored it must be {stored - 1}"
+        )
     return Header(
         name=name, data=data, dataset=dataset, enhanced=kind == ENHANCED, rows=rows,
         columns=columns, frames=frames, bits=bits, syntax=syntax,

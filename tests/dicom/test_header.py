@@ -60,6 +60,16 @@ def test_twelve_bits_and_an_overlay_above_them(tmp_path):
     np.testing.assert_array_equal(run.decode(1), frames[1])
 
 
+def test_twelve_bits_at_the_upper_end_and_an_overlay_below_them(tmp_path):
+    frames = vessel_frames(2).astype(np.uint16) * 10
+    ds = classic(frames << 4 | 0x5, BitsStored=12, HighBit=15)
+    run = Frames(read_header(save(ds, tmp_path / "a.dcm")))
+    np.testing.assert_array_equal(run.decode(1), frames[1])
+    del ds.HighBit
+    run = Frames(read_header(save(ds, tmp_path / "a.dcm")))
+    np.testing.assert_array_equal(run.decode(1), (frames[1].astype(int) << 4 | 5) & 0xFFF)
+
+
 def test_monochrome1_is_turned_round(tmp_path):
     frames = vessel_frames()
     ds = classic(frames, PhotometricInterpretation="MONOCHROME1")
@@ -80,6 +90,10 @@ def test_monochrome1_is_turned_round(tmp_path):
         ({"PixelRepresentation": 1}, "signed"),
         ({"BitsAllocated": 32, "BitsStored": 32}, "32 bits"),
         ({"BitsStored": 9}, "colour or signed"),
+        ({"PhotometricInterpretation": "PALETTE COLOR"}, "colour or signed"),
+        ({"HighBit": 6}, r"HighBit \(0028,0102\) = 6; for 8 bits stored it must be 7"),
+        ({"HighBit": 8}, "HighBit"),
+        ({"PhotometricInterpretation": ""}, r"has no PhotometricInterpretation \(0028,0004\)"),
     ],
 )
 @pytest.mark.req("REQ-10")
@@ -99,7 +113,12 @@ def test_damage(tmp_path):
     refused(tmp_path, b"", "empty")
     refused(tmp_path, b"\x89PNG" + data[4:128] + b"NOPE" + data[132:], "not a DICOM file")
     refused(tmp_path, data[:-100], "truncated|no readable pixels")
-    refused(tmp_path, data[:400], "damaged|holds|pixels")
+    for end in range(280, data.index(b"\xe0\x7f\x10\x00"), 9):  # wherever the header is cut
+        refused(tmp_path, data[:end], "ends before its pixels|damaged header")
+    refused(tmp_path, data[:400], "truncated")
+    silent = classic()
+    del silent.PixelRepresentation
+    refused(tmp_path, as_bytes(silent), r"has no PixelRepresentation \(0028,0103\)")
     deflated = classic()
     deflated.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1.99"
     refused(tmp_path, as_bytes(deflated), "deflated")
