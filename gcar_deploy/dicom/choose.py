@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import cv2
@@ -11,6 +13,9 @@ import numpy as np
 
 from gcar_deploy.dicom.header import Header
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.imaging.angiogram import DEFAULT_FIELD_MM
+from gcar_deploy.imaging.enhance import darkness
 from gcar_deploy.types import Array, Image, Scalars
 
 #: frames filled to this share of the best are compared by their stillness
@@ -19,6 +24,9 @@ _FILLED_SHARE = 0.9
 _LEAST_FILLED_SHARE = 0.5
 #: frames are compared at this size, pixels along the longer side
 _SIDE = 192
+#: so many frames are asked whether vessels are dark; what they say counts where the ridges of one
+#: sign are 1.5 times as strong, as in ``imaging.polarity``
+_ASKED, _SURE = 6, math.log(1.5)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,7 +58,9 @@ class FrameSource(Protocol):
         """(rows, columns) float32 counts of a frame, from 0."""
 
 
-def choose_frame(frames: FrameSource, wanted: int | None, name: str = "") -> Choice:
+def choose_frame(
+    frames: FrameSource, wanted: int | None, name: str = "", intensity: Intensity | None = None
+) -> Choice:
     """Take the frame asked for, else one at an R wave, the file's own, or the best filled.
 
     Parameters
@@ -58,6 +68,7 @@ def choose_frame(frames: FrameSource, wanted: int | None, name: str = "") -> Cho
     frames : Frames, or another run of several pictures
     wanted : int from 1, or None to choose
     name : of the run, for messages; the header's where it has one
+    intensity : what a count means; None where nobody says it
 
     Raises
     ------
@@ -74,7 +85,7 @@ def choose_frame(frames: FrameSource, wanted: int | None, name: str = "") -> Cho
         return Choice(index=wanted - 1, reason="asked for")
     if len(frames) == 1:
         return Choice(index=0, reason="the only one")
-    filling, motion = filling_and_motion(frames)
+    filling, motion = filling_and_motion(frames, intensity)
     beats = [] if header is None else r_wave_frames(header)
     if beats:
         best = max(beats, key=lambda k: filling[k])
@@ -121,16 +132,22 @@ def _frame_times(header: Header) -> Scalars | None:
     return None if not step else np.arange(header.frames, dtype=np.float64) * step
 
 
-def filling_and_motion(frames: FrameSource) -> tuple[Scalars, Scalars]:
+def filling_and_motion(
+    frames: FrameSource, intensity: Intensity | None = None
+) -> tuple[Scalars, Scalars]:
     """Contrast filling (1 where it is best) and motion of every frame.
 
-    Filling is the mean black top-hat: dark lines narrower than a large vessel. What stays in all
-    frames (spine, ribs, wires) is in all of them alike. Motion is the mean change to the
-    neighbours.
+    Filling is the mean black top-hat: dark lines narrower than a large vessel; a run in which
+    vessels are bright is turned round first. What stays in all frames (spine, ribs, wires) is in
+    all of them alike. Motion is the mean change to the neighbours.
     """
     small = [_small(frames.decode(k)) for k in range(len(frames))]
+    if not _is_dark(small, intensity or Intensity(kind="raw")):
+        # About the middle of all counts that there are, as MONOCHROME1 is.
+        top = 2.0 ** math.ceil(math.log2(max(float(p.max()) for p in small) + 1.0)) - 1.0
+        small = [top - p for p in small]
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
-    hat = [cv2.morphologyEx(p, cv2.MORPH_BLACKHAT, disc) for p in small]
+    hat = [cv2.morphologyEx(_level(p), cv2.MORPH_BLACKHAT, disc) for p in small]
     lines = np.array([float(h.mean()) for h in hat])
     # A run without inflow varies by less than a tenth: its noise must not decide.
     spread = max(float(np.ptp(lines)), 0.1 * float(lines.max()), 1e-12)
@@ -143,7 +160,21 @@ def filling_and_motion(frames: FrameSource) -> tuple[Scalars, Scalars]:
 def _small(picture: Array) -> Array:
     scale = min(1.0, _SIDE / max(picture.shape))
     size = (max(8, round(picture.shape[1] * scale)), max(8, round(picture.shape[0] * scale)))
-    level = np.log1p(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+
+def _is_dark(small: Sequence[Array], intensity: Intensity) -> bool:
+    """Whether vessels are dark: declared, else by the frame that tells most, else as usual."""
+    if intensity.polarity != "auto":
+        return intensity.polarity == "dark"
+    pixel_mm = DEFAULT_FIELD_MM / max(small[0].shape)
+    some = small[:: max(1, len(small) // _ASKED)]
+    said = max((darkness(one, pixel_mm) for one in some), key=abs)
+    return said > (-_SURE if intensity.kind == "raw" else _SURE)
+
+
+def _level(small: Array) -> Array:
+    level = np.log1p(small)
     return cv2.GaussianBlur(level.astype(np.float32), (0, 0), 1.0)
 
 

@@ -72,7 +72,8 @@ def read_run(
         chosen: ChosenFrame | None = wanted
         choice = Choice(index=wanted.number - 1, reason=wanted.reason)
     else:
-        choice, chosen = choose_frame(frames, wanted), None
+        choice = choose_frame(frames, wanted, intensity=intensity_of(header, 0)[0])
+        chosen = None
         if wanted is None and len(frames) > 1:
             chosen = ChosenFrame(number=choice.index + 1, of=len(frames), reason=choice.reason)
     pixels = frames.decode(choice.index)

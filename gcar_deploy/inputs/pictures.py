@@ -188,7 +188,7 @@ def _by_scene(
             headers[number] = run.header
             notes += [f"view {view.id}: {note}" for note in run.notes]
         elif number in runs.cines:
-            *read, frame = runs.frame(number, chosen)
+            *read, frame = runs.frame(number, chosen, view.intensity)
             made = _as_angiogram(read, view, options.imaging, notes, picture)
             angiograms.append(dataclasses.replace(made, frame=frame))
             if frame is not None:

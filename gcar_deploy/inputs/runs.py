@@ -17,7 +17,7 @@ from gcar_deploy.frames.bare import bare_before
 from gcar_deploy.frames.choose import SeenRun, choose_frames, masses_of, pair_of, stands_still
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.scene import Scene, match_picture
+from gcar_deploy.geometry.scene import Intensity, Scene, match_picture
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.frame import ChosenFrame, FramePair
@@ -42,7 +42,7 @@ class Runs:
     wanted: Mapping[int, int | None]
 
     def frame(
-        self, number: int, chosen: Mapping[int, ChosenFrame]
+        self, number: int, chosen: Mapping[int, ChosenFrame], intensity: Intensity
     ) -> tuple[Image, int, str, ChosenFrame | None]:
         """Read the frame of a run that is no DICOM file.
 
@@ -53,7 +53,7 @@ class Runs:
         cine, asked = self.cines[number], self.wanted[number]
         frame = chosen.get(number)
         if frame is None:
-            choice = choose_frame(cine, asked, cine.name)
+            choice = choose_frame(cine, asked, cine.name, intensity)
             if asked is None and len(cine) > 1:
                 frame = ChosenFrame(number=choice.index + 1, of=len(cine), reason=choice.reason)
             return (*cine.read(choice.index), frame)

@@ -13,8 +13,9 @@ import tifffile
 from PIL import Image as Pillow
 
 from gcar_deploy.config import DicomLimits, DicomOptions, RunOptions
+from gcar_deploy.dicom.choose import choose_frame
 from gcar_deploy.errors import ImageError, UsageError
-from gcar_deploy.frames.cine import is_cine, open_cine
+from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.imaging.frame import ChosenFrame, FramePair
 from gcar_deploy.inputs.pictures import prepare
@@ -112,6 +113,17 @@ def test_pages_that_run_in_a_circle_end(tmp_path):
     (tmp_path / "circle.tif").write_bytes(data)
     with pytest.raises(ImageError, match="runs in a circle"):
         open_cine(tmp_path / "circle.tif", OPTIONS)
+
+
+@pytest.mark.parametrize("polarity", ["auto", "bright"])
+def test_a_run_in_which_vessels_are_bright_chooses_the_frame_of_the_dark_one(made, polarity):
+    def chosen(pixels, polarity):
+        cine = Cine(name="run", count=len(pixels), read=lambda k: (np.float32(pixels[k]), 8, ""))
+        return choose_frame(cine, None, intensity=Intensity(kind="raw", polarity=polarity)).index
+
+    # Seen alone, the second run does not tell which it is, and is taken as is usual.
+    for run in made.runs[:1] if polarity == "auto" else made.runs:
+        assert chosen(255 - run.pixels, polarity) == chosen(run.pixels, "dark")
 
 
 @pytest.mark.slow
