@@ -144,7 +144,7 @@ class Engine:
         """
         if deadline_s is not None:
             check_number("deadline_s", deadline_s, float, Range(1e-9, 1e9))
-        task = _Task(views, geometry, masks or {}, {}, self.options, deadline_s)
+        task = _Task(views, geometry, masks, {}, self.options, deadline_s)
         return self._solve(task, on_progress, cancel, on_step)
 
     def reconstruct_order(
@@ -214,7 +214,7 @@ class _Task:
 
     views: Sequence[Picture]
     geometry: Geometry | None
-    masks: Mapping[int, Mask]
+    masks: Mapping[int, Mask] | None
     drawn: Mapping[int, Drawn]
     options: RunOptions
     deadline_s: float | None

@@ -66,6 +66,8 @@ def prepare(
         A picture or mask cannot be read.
     """
     _check_kinds(views)
+    masks = {} if masks is None else masks
+    _check_masks(masks)
     if geometry is None:
         angiograms, grid, notes = _from_headers(views, options, check)
     elif isinstance(geometry, Grid):
@@ -76,7 +78,6 @@ def prepare(
         dataclasses.replace(one, file=Path(view).name) if isinstance(view, (str, Path)) else one
         for one, view in zip(angiograms, views, strict=True)
     ]
-    masks = masks or {}
     angiograms = with_masks(angiograms, masks, options.imaging.limits)
     notes += [f"view {k}: the vessel mask is the user's" for k in masks]
     for k, lines in (drawn or {}).items():
@@ -97,6 +98,17 @@ def _check_kinds(views: Sequence[Picture]) -> None:
                 f"view {number} is a {type(view).__name__}; give a path, an array of counts or an "
                 "Angiogram"
             )
+
+
+def _check_masks(masks: Mapping[int, Mask]) -> None:
+    how = "give a dict: number of the view, from 1 -> path or array"
+    if not isinstance(masks, Mapping):
+        raise UsageError(f"masks is a {type(masks).__name__}; {how}")
+    for number, mask in masks.items():
+        if not isinstance(number, (int, np.integer)):
+            raise UsageError(f"masks has a {type(number).__name__} as a key; {how}")
+        if not isinstance(mask, (str, Path, np.ndarray)):
+            raise UsageError(f"mask {number} is a {type(mask).__name__}; {how}")
 
 
 def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
@@ -290,12 +302,16 @@ def _from_array(
             f"{limits.min_side} .. {limits.max_side}"
         )
     given, array = array, from_zero(array) if view.intensity.subtracted else array
-    if not (np.isfinite(array).all() and array.min() >= 0):
-        raise ImageError(f"view {view_id}: grey values must be finite and not negative")
+    with np.errstate(over="ignore"):
+        # Columns first in memory is the same picture: what follows looks at rows.
+        pixels = array.astype(np.float32, order="C")
+    if not (np.isfinite(pixels).all() and pixels.min() >= 0):
+        raise ImageError(
+            f"view {view_id}: grey values must be finite in single precision and not negative"
+        )
     sha256 = hashlib.sha256(f"{given.dtype.name}{given.shape}".encode())
     sha256.update(np.ascontiguousarray(given).tobytes())
-    # Columns first in memory is the same picture: what follows looks at rows.
-    return array.astype(np.float32, order="C"), depth, sha256.hexdigest()
+    return pixels, depth, sha256.hexdigest()
 
 
 def _scene(geometry: Geometry) -> Scene:

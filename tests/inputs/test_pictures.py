@@ -8,10 +8,14 @@ import shutil
 import numpy as np
 import pytest
 
-from gcar_deploy.config import DicomOptions, RunOptions
+from gcar_deploy.config import DicomOptions, PredictOptions, RunOptions
+from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, ImageError, UsageError
 from gcar_deploy.inputs.pictures import prepare
 from tests.cli.conftest import geometry, good_case  # noqa: F401 - a fixture
+
+MASK = np.eye(96, dtype=bool)
+THIN = RunOptions(predict=PredictOptions(predictor="none"))
 
 
 @pytest.mark.parametrize(
@@ -41,6 +45,30 @@ def test_views_of_a_wrong_type(views, words):
 def test_geometry_of_a_wrong_type(told, words):
     with pytest.raises(UsageError, match=words):
         prepare([np.zeros((96, 96), np.uint8)] * 2, told, RunOptions())
+
+
+@pytest.mark.parametrize(
+    ("masks", "words"),
+    [
+        ([MASK], "masks is a list; give a dict: number of the view"),
+        (MASK, "masks is a ndarray; give a dict"),
+        ({"1": MASK}, "masks has a str as a key; give a dict"),
+        ({1: None}, "mask 1 is a NoneType; give a dict"),
+        ({3: MASK}, "mask 3: there are views 1 .. 2"),
+    ],
+)
+def test_masks_of_a_wrong_type(good_case, masks, words):  # noqa: F811
+    files = [good_case / "view1.png", good_case / "view2.png"]
+    with pytest.raises(UsageError, match=words):
+        Engine(options=THIN).reconstruct(files, geometry(), masks=masks)
+
+
+@pytest.mark.parametrize("value", [1e300, 1e39, np.inf, np.nan, -1.0])
+@pytest.mark.filterwarnings("error")
+def test_counts_that_single_precision_does_not_hold(value):
+    views = [np.full((96, 96), value)] * 2
+    with pytest.raises(ImageError, match="view 1: grey values must be finite in single precision"):
+        prepare(views, geometry(), RunOptions())
 
 
 def test_an_array_of_two_pictures_is_two_pictures(good_case):  # noqa: F811
