@@ -210,8 +210,8 @@ def intensity_of(header: Header, frame: int) -> tuple[Intensity, list[str]]:
     if relation != "LIN":
         what = "display-processed (DISP)" if relation == "DISP" else f"called {relation or 'none'}"
         notes.append(
-            f"grey values are {what}: no measure of the contrast passed through, so masks and "
-            "centrelines carry the fit"
+            f"grey values are {what}: path lengths are estimated from their contrast and the "
+            "widths of the vessels, under the law that fits the display"
         )
     return Intensity(kind="raw", polarity=polarity), notes
 

@@ -79,5 +79,5 @@ def test_two_runs_make_a_tree(folder, tmp_path):
     assert done.code == 0
     found = json.loads(done.out)
     assert found["tree"]["length_mm"] > 300
-    assert any("carry the fit" in note for note in found["notes"])
+    assert any("estimated from their contrast" in note for note in found["notes"])
     assert all(view["coverage"] > 0.8 for view in found["views"])

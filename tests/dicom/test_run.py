@@ -132,7 +132,7 @@ def test_a_shutter_that_leaves_nothing_or_everything(run):
 def test_meaning_of_the_grey_values(run, changes, kind, polarity):
     found = run(**changes)
     assert (found.intensity.kind, found.intensity.polarity) == (kind, polarity)
-    said = any("carry the fit" in note for note in found.notes)
+    said = any("estimated from their contrast" in note for note in found.notes)
     assert said == (changes["PixelIntensityRelationship"] not in ("LIN", "LOG"))
 
 
