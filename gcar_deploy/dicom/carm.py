@@ -77,15 +77,39 @@ def _angles(header: Header, frame: int, notes: list[str]) -> tuple[float, float]
         keyword = f"Positioner{axis}Angle"
         angle = header.number(keyword, frame)
         if angle is None:
-            angle = header.number(f"PositionerIsocenter{axis}Angle", frame)
-        if angle is None:
-            raise GeometryError(f"{tag(keyword)} is missing; {_WAY_OUT}")
+            angle = _isocenter_angle(header, keyword, axis, frame, notes)
         if not header.enhanced:
             angle += _increment(header, keyword, frame, notes)
         found.append(angle)
     # Sums of angle and increment may pass the back; the direction is the same.
     primary = found[0] if abs(found[0]) <= 180.0 else (found[0] + 180.0) % 360.0 - 180.0
     return primary, found[1]
+
+
+def _isocenter_angle(
+    header: Header, keyword: str, axis: str, frame: int, notes: list[str]
+) -> float:
+    """Angle against the room, which is the one against a patient who lies head first, supine."""
+    other = f"PositionerIsocenter{axis}Angle"
+    angle = header.number(other, frame)
+    if angle is None:
+        raise GeometryError(f"{tag(keyword)} is missing; {_WAY_OUT}")
+    position = header.text("PatientPosition", frame)
+    if position not in ("", "HFS"):
+        raise GeometryError(
+            f"{tag(keyword)} is missing, and {tag(other)} counts from the room: that is the "
+            f"patient only with {tag('PatientPosition')} = HFS, not {position[:16]}; {_WAY_OUT}"
+        )
+    tilts = (
+        f"Table{kind}Angle" for kind in ("HorizontalRotation", "HeadTilt", "CradleTilt")
+        if header.number(f"Table{kind}Angle", frame)
+    )  # fmt: skip
+    tilted = "".join(f"; {tag(key)} is not applied" for key in tilts)
+    notes.append(
+        f"{tag(keyword)} is missing, {tag(other)} is taken for it: right for a patient who lies "
+        f"head first, supine, on a level table{tilted}"
+    )
+    return angle
 
 
 def _increment(header: Header, keyword: str, frame: int, notes: list[str]) -> float:

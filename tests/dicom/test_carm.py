@@ -231,6 +231,26 @@ def test_enhanced_without_angles_asks_for_a_geometry(tmp_path):
         frame_carm(read_header(path), 0, OPTIONS)
 
 
+def test_angles_against_the_room_are_said_and_need_a_patient_head_first_supine(tmp_path):
+    room = {
+        "IsocenterReferenceSystemSequence": {
+            "PositionerIsocenterPrimaryAngle": -30.0, "PositionerIsocenterSecondaryAngle": -20.0,
+        },
+        "TablePositionSequence": {"TableHeadTiltAngle": 10.0, "TableCradleTiltAngle": 0.0},
+    }  # fmt: skip
+    ds = enhanced(vessel_frames(), [room], GROUPS)
+    for position in (None, "HFS"):
+        if position:
+            ds.PatientPosition = position
+        view, notes = frame_carm(read_header(save(ds, tmp_path / "a.dcm")), 0, OPTIONS)
+        assert (view.primary_angle_deg, view.secondary_angle_deg) == (-30, -20)
+        assert "PositionerIsocenterPrimaryAngle" in notes[0] and "TableHeadTiltAngle" in notes[0]
+        assert "TableCradleTiltAngle" not in notes[0]
+    ds.PatientPosition = "FFS"
+    with pytest.raises(GeometryError, match=r"a\.dcm: PositionerPrimaryAngle.*= HFS, not FFS"):
+        frame_carm(read_header(save(ds, tmp_path / "a.dcm")), 0, OPTIONS)
+
+
 def test_two_runs_make_a_scene(tmp_path):
     a = save(classic(), tmp_path / "a.dcm")
     b = save(classic(PositionerPrimaryAngle="-40"), tmp_path / "b.dcm")
