@@ -101,10 +101,12 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and leave with the exit code of the contract."""
     arguments = sys.argv[1:] if arguments is None else arguments
     verbose = "-v" in arguments or "--verbose" in arguments
-    if sys.stderr is None:
-        # Closed by whoever called: nobody has to ask, and no file opened later gets its number.
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - open until the end
-        os.set_inheritable(sys.stderr.fileno(), True)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # Closed by whoever called: nobody has to ask, and no file opened later gets its number.
+            stream = open(os.devnull, "w")  # noqa: SIM115 - open until the end
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
     # All memory goes with the process: looking for cycles in it first takes 0.1 s.
     atexit.register(gc.freeze)
     # Many small products: shared out, they wait for each other where another program has a core,

@@ -44,6 +44,18 @@ def test_a_closed_standard_error_is_none(verb, good_case, tmp_path):
     assert verb == "bench" or (tmp_path / "out").is_dir()
 
 
+def test_a_closed_standard_output_is_none(good_case, tmp_path):
+    """As of standard error: the result is made, and who writes to the number hits no file."""
+    done = in_shell(">&-", tmp_path, *words_of("run", good_case, tmp_path))
+    assert (done.returncode, done.stderr) == (0, "") and (tmp_path / "out").is_dir()
+    code = (
+        "import os\nfrom gcar_deploy.cli.main import main\n"
+        "try:\n    main(['--version'])\nfinally:\n    os.write(1, b'to nobody')"
+    )
+    shell = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-c", code]
+    assert subprocess.run(shell, capture_output=True).returncode == 0
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 @pytest.mark.parametrize("verb", ["demo", "batch"])
 def test_a_result_whose_summary_nobody_can_read_stays_and_is_named(verb, good_case, tmp_path):
