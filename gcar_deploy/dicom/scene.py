@@ -16,7 +16,7 @@ from gcar_deploy.dicom.choose import Choice, choose_frame
 from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import PATIENT, SYNTAXES, Header, read_header, tag
 from gcar_deploy.dicom.shutter import open_field
-from gcar_deploy.errors import GeometryError, UsageError
+from gcar_deploy.errors import GeometryError, RefusedError, UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.frame import ChosenFrame
@@ -126,23 +126,27 @@ def read_views(
         views.append(view)
         angiograms.append(as_angiogram(run, view))
         headers[number] = run.header
-    notes += with_origin(angiograms, headers)
+    notes += check_origin(headers)
     # The one set of checks that every scene passes, whatever it was written in.
     scene = parse_scene(scene_to_json(Scene(views=tuple(views))), "the geometry in the headers")
     return angiograms, scene, [*notes, *scene.warnings]
 
 
-def with_origin(angiograms: list[Angiogram], headers: Mapping[int, Header]) -> list[str]:
-    """Hold against each other whom the runs show: a doubt where these are different patients.
+def check_origin(headers: Mapping[int, Header]) -> list[str]:
+    """Hold against each other whom the runs show.
 
     Parameters
     ----------
-    angiograms : of all views; the doubt is put to that of the later run
     headers : number of the view, from 1 -> its header; values of it are not repeated
 
     Returns
     -------
     notes : of runs of one patient, whether they are of different studies
+
+    Raises
+    ------
+    RefusedError
+        They are of different patients.
     """
     notes = []
     for a, b in itertools.combinations(sorted(headers), 2):
@@ -152,13 +156,11 @@ def with_origin(angiograms: list[Angiogram], headers: Mapping[int, Header]) -> l
         differ = [key for key in one if one[key] and other[key] and one[key] != other[key]]
         patient = [key for key in differ if key in PATIENT]
         if patient:
-            doubt = (
+            raise RefusedError(
                 f"the headers of views {a} and {b} tell of different patients "
                 f"({', '.join(map(tag, patient))})"
             )
-            seen = angiograms[b - 1]
-            angiograms[b - 1] = dataclasses.replace(seen, doubts=(*seen.doubts, doubt))
-        elif differ:
+        if differ:
             notes.append(f"views {a} and {b} are of different studies")
     return notes
 

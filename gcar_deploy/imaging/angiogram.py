@@ -49,8 +49,6 @@ class Angiogram:
         Frames of the same run before contrast came; what is a line there is no vessel.
     file : str
         Name of the file that it was read from; empty for an array.
-    doubts : tuple of str
-        Sentences of whoever read it that make a result ``degraded``.
     """
 
     view_id: str
@@ -66,7 +64,6 @@ class Angiogram:
     frame: ChosenFrame | None = None
     bare: tuple[Image, ...] = ()
     file: str = ""
-    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)

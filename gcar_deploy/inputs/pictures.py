@@ -13,7 +13,7 @@ import numpy as np
 
 from gcar_deploy.config import DicomOptions, ImagingOptions, PictureLimits, RunOptions
 from gcar_deploy.dicom.header import is_dicom
-from gcar_deploy.dicom.scene import as_angiogram, read_run, read_views, with_origin
+from gcar_deploy.dicom.scene import as_angiogram, check_origin, read_run, read_views
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
@@ -207,7 +207,7 @@ def _by_scene(
                 notes.append(f"view {view.id}: frame {frame.number} of {frame.of}: {frame.reason}")
         else:
             angiograms.append(_angiogram(picture, view, options.imaging, notes))
-    notes += with_origin(angiograms, headers)
+    notes += check_origin(headers)
     angiograms, more = with_bare(angiograms, runs, seen)
     return angiograms, scene.volume_grid(), notes + more
 

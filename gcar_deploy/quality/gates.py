@@ -49,8 +49,7 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
             f"views are {angle:.1f} deg apart (folded to 0 .. 90); at least "
             f"{options.min_separation_deg:g} deg are needed to see depth"
         )
-    findings = [doubt for one in angiograms for doubt in one.doubts]
-    findings += _frame_findings(angiograms, options)
+    findings = _frame_findings(angiograms, options)
     if angle < options.good_separation_deg:
         findings.append(
             f"views are only {angle:.1f} deg apart (folded to 0 .. 90): depth is uncertain below "

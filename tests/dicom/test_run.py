@@ -11,13 +11,14 @@ from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
 from gcar_deploy.config import DicomOptions, PredictOptions, RunOptions
+from gcar_deploy.dicom.carm import frame_carm
 from gcar_deploy.dicom.frames import Frames
+from gcar_deploy.dicom.header import read_header
 from gcar_deploy.dicom.scene import read_run, read_views
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import CancelledError, UsageError
-from gcar_deploy.geometry.scene import scene_to_json
+from gcar_deploy.errors import CancelledError, RefusedError, UsageError
+from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.inputs.pictures import prepare
-from gcar_deploy.quality import check_views
 from tests.dicom.files import classic, enhanced, save, vessel_frames
 
 OPTIONS = DicomOptions()
@@ -193,18 +194,24 @@ def pair_of(folder, *told):
         ({"PatientName": "ZZ^A"}, {"PatientName": "ZZ^B"}, None),
     ],
 )
-def test_runs_of_different_patients_are_a_finding(own, others, said, tmp_path):
+def test_runs_of_different_patients_are_refused(own, others, said, tmp_path):
     runs = pair_of(tmp_path, own, others)
-    angiograms, scene, notes = read_views(runs, OPTIONS)
-    by_scene, _, _ = prepare(runs, json.loads(scene_to_json(scene)), RunOptions())
-    for views in (angiograms, by_scene):
-        findings = check_views(views, RunOptions().quality)
-        assert findings == [] if said is None else said in findings[0]
-        assert not any("ZZ" in text or "1901" in text for text in (*findings, *notes))
+    carms = [frame_carm(read_header(run), 0, OPTIONS)[0] for run in runs]
+    views = tuple(
+        View(id=str(k), carm=carm, intensity=Intensity(kind="raw"))
+        for k, carm in enumerate(carms, start=1)
+    )
+    scene = json.loads(scene_to_json(Scene(views=views)))
+    for read in (lambda: read_views(runs, OPTIONS), lambda: prepare(runs, scene, RunOptions())):
+        if said is None:
+            assert not any("ZZ" in note for note in read()[2])
+            continue
+        with pytest.raises(RefusedError) as refused:
+            read()
+        told = str(refused.value)
+        assert said in told and "ZZ" not in told and "1901" not in told
 
 
 def test_different_studies_of_one_patient_are_said(tmp_path):
     runs = pair_of(tmp_path, *({"PatientID": "1", "StudyInstanceUID": f"1.2.{k}"} for k in "12"))
-    angiograms, _, notes = read_views(runs, OPTIONS)
-    assert "views 1 and 2 are of different studies" in notes
-    assert not check_views(angiograms, RunOptions().quality)
+    assert "views 1 and 2 are of different studies" in read_views(runs, OPTIONS)[2]
