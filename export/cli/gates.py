@@ -54,8 +54,7 @@ def _measured(
 def _labels(data: Path | None, cases: str) -> list[Path]:
     from gcar_export.evaluate.evaluate import find_labels
 
-    files = find_labels(data) if data else []
-    return [f for f in files if not cases or f.name.split(".")[0] in words(cases)]
+    return find_labels(data, words(cases)) if data else []
 
 
 def _say(parts: Sequence[str], file: Path) -> None:

@@ -31,15 +31,14 @@ def refine_table(data: Path, cases: str, protocols: str, noises: str, out: Path 
 
     Example: gcar-export refine-table --data data --cases 0001,0134,0595 --out fits
     """
+    from gcar_export.evaluate.evaluate import find_labels
     from gcar_export.studies import refine_table as refining
 
     try:
         levels = [float(word) for word in words(noises)]
     except ValueError:
         raise UsageError(f"--noises {noises!r} is not a comma-separated list of numbers") from None
-    count = len(refining.labels_of(data, words(cases)))
-    if not count:
-        raise UsageError(f"--cases {cases}: none of them is in {data}")
+    count = len(find_labels(data, words(cases)))
     total = count * len(levels) * len(refining.MODES) * len(words(protocols))
     tables = []
     with click.progressbar(length=total, label="fits", file=sys.stderr) as bar:

@@ -22,6 +22,7 @@ from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run
 from gcar_export.evaluate.jobs import Job, case_name, row_path, write_done
 from gcar_export.methods.settings import METHODS, MethodSettings
 from gcar_export.methods.solve import check_models
+from gcar_export.scenes.labels import case_stem
 from gcar_export.scenes.protocols import COMMON, PROTOCOLS
 from gcar_export.scenes.thin_protocol import THIN, thin_names
 
@@ -79,6 +80,11 @@ class EvaluateOptions:
         if self.protocol not in (*PROTOCOLS, *GROUPS):
             known = ", ".join((*PROTOCOLS, *GROUPS))
             raise UsageError(f"protocol {self.protocol!r} is none of {known}")
+        for key in ("methods", "views", "cases"):
+            given = getattr(self, key)
+            twice = [value for k, value in enumerate(given) if value in given[:k]]
+            if twice:
+                raise UsageError(f"{key}: {twice[0]} is named twice")
         unknown = [m for m in self.methods if m not in METHODS]
         if unknown or not self.methods:
             raise UsageError(f"unknown method {unknown}; there are {', '.join(METHODS)}")
@@ -101,13 +107,18 @@ class EvaluateOptions:
         return GROUPS.get(self.protocol, (self.protocol,))
 
 
-def find_labels(data: Path) -> list[Path]:
+def find_labels(data: Path, cases: Sequence[str] = ()) -> list[Path]:
     """Label volumes below a folder: ImageCAS, ASOCA, or any mask lying in it.
+
+    Parameters
+    ----------
+    data : folder
+    cases : only those with these names; all if empty
 
     Raises
     ------
     UsageError
-        If there are none.
+        There are none, a case is not among them, or two files have the name of one case.
     """
     found: dict[Path, None] = {}
     for folder in (data, data / "data"):
@@ -115,7 +126,7 @@ def find_labels(data: Path) -> list[Path]:
             for path in sorted(folder.glob(pattern)):
                 found.setdefault(path.resolve())
         if found:
-            return list(found)
+            return _chosen(list(found), cases, data)
     raise UsageError(f"no label volume in {data} ({', '.join(LABEL_PATTERNS)})")
 
 
@@ -137,11 +148,11 @@ def evaluate(
         A method's model is missing.
     """
     generated = options.protocol == "thin"
-    known = thin_names() if generated else find_labels(_given(options.data))
-    labels = [p for p in known if _wanted(p, options.cases)]
-    if not labels:
-        where = f"{known[0].name} .. {known[-1].name}" if generated else options.data
-        raise UsageError(f"none of the cases {', '.join(options.cases)} is in {where}")
+    if generated:
+        known = thin_names()
+        labels = _chosen(known, options.cases, f"{known[0].name} .. {known[-1].name}")
+    else:
+        labels = find_labels(_given(options.data), options.cases)
     check_models(options.methods, options.settings)
     digests = {method: options.settings.digest(method) for method in options.methods}
     jobs = [
@@ -247,5 +258,17 @@ def _given(data: Path | None) -> Path:
     return data
 
 
-def _wanted(label: Path, names: Sequence[str]) -> bool:
-    return not names or case_name(label) in names or label.name.split(".")[0] in names
+def _chosen(labels: Sequence[Path], cases: Sequence[str], where: object) -> list[Path]:
+    """Return the labels of these cases, of all without any; ``where`` they were looked for."""
+    names = {label: {case_stem(label), case_name(label)} for label in labels}
+    known = set().union(*names.values())
+    unknown = [case for case in cases if case not in known]
+    if unknown:
+        raise UsageError(f"cases: {', '.join(unknown)} is not in {where}")
+    chosen = [label for label in labels if not cases or names[label] & set(cases)]
+    first: dict[str, Path] = {}
+    for label in chosen:
+        other = first.setdefault(case_stem(label), label)
+        if other != label:
+            raise UsageError(f"{other} and {label} are both case {case_stem(label)}: rename one")
+    return chosen

@@ -27,7 +27,7 @@ from gcar_deploy.measure.metrics import (
 from gcar_deploy.types import Array, Volume
 from gcar_export.methods.settings import MethodSettings
 from gcar_export.methods.solve import Solved, solve
-from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.labels import LabelVolume, case_stem, read_label
 from gcar_export.scenes.protocols import COMMON, Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
 from gcar_export.scenes.thin_protocol import THIN, line_measures, thin_case
@@ -81,7 +81,7 @@ class Done:
 
 def case_name(label: Path) -> str:
     """Name of the case a label file holds, as ``read_label`` gives it."""
-    stem = label.name.split(".")[0]
+    stem = case_stem(label)
     return f"asoca_{stem}" if label.suffix == ".npz" else stem
 
 

@@ -8,6 +8,7 @@ that nothing downstream knows whether a tree came from ImageCAS (``*.label.nii.g
 from __future__ import annotations
 
 import dataclasses
+import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -175,6 +176,15 @@ class LabelVolume:
         return dataclasses.replace(self, occupancy=np.ascontiguousarray(occupancy), grid=grid)
 
 
+#: what a file name has beside the name of the case
+_SUFFIX = re.compile(r"(\.label)?\.(nii|nii\.gz|nrrd|nhdr|mha|mhd|npz)$", re.IGNORECASE)
+
+
+def case_stem(path: Path) -> str:
+    """Return a label file's name without its known suffixes; other dots belong to the name."""
+    return _SUFFIX.sub("", path.name)
+
+
 #: what a damaged file raises inside NumPy, nibabel, zlib and zipfile
 _DAMAGE = (
     ValueError, OSError, EOFError, KeyError, MemoryError, OverflowError, ZeroDivisionError,
@@ -197,7 +207,7 @@ def read_label(path: str | Path) -> LabelVolume:
     if not path.is_file():
         raise UsageError(f"no such label volume: {path}")
     name = path.name.lower()
-    case = path.name.split(".")[0]
+    case = case_stem(path)
     try:
         if name.endswith(".npz"):
             label = _read_npz(path, case)

@@ -95,9 +95,7 @@ def measure(
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Row]:
     """Predict every tree of ``data`` with every model."""
-    files = [f for f in find_labels(data) if not cases or f.name.split(".")[0] in cases]
-    if not files:
-        raise UsageError(f"{data}: none of the cases {', '.join(cases)} is there")
+    files = find_labels(data, cases)
     rows: list[Row] = []
     for done, file in enumerate(files):
         case = make_case(read_label(file), protocol)
@@ -123,7 +121,7 @@ def cost(
     repeats: int = 7,
 ) -> list[Cost]:
     """Time inference and projections in turns on the first case; measure memory."""
-    files = [f for f in find_labels(data) if not cases or f.name.split(".")[0] in cases]
+    files = find_labels(data, cases)
     case = make_case(read_label(files[0]), protocol)
     posed = pose(case.angiograms(), case.grid)
     work = {"pair": _pair(case)}

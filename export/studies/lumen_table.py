@@ -15,6 +15,7 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.tree.tree import Tree, along
+from gcar_export.scenes.labels import case_stem
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
     Tube,
@@ -82,7 +83,7 @@ def lumen_rows(
         rng = np.random.default_rng(9_000_000 + k)
         if labels:
             path = labels[k % len(labels)]
-            name, vessels = path.name.split(".")[0], trees[path]
+            name, vessels = case_stem(path), trees[path]
         else:
             name, vessels = f"generated {k}", generated_tubes(9_000_000 + k)
         case = with_stenosis(name, vessels, rng)

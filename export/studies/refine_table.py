@@ -192,7 +192,7 @@ def refine_rows(
 ) -> list[Row]:
     """Fit every case from every start in every mode; rows that ``out`` has are read, not made."""
     rows = []
-    for path in labels_of(data, cases):
+    for path in find_labels(data, cases):
         subject = None
         for mode in MODES:
             for noise in noises:
@@ -206,11 +206,6 @@ def refine_rows(
                 if on_fit is not None:
                     on_fit()
     return rows
-
-
-def labels_of(data: Path, cases: Sequence[str]) -> list[Path]:
-    """Label volumes of the wanted cases, all where none are named."""
-    return [p for p in find_labels(data) if not cases or case_name(p) in cases]
 
 
 def table(rows: Sequence[Row], protocol: str) -> str:

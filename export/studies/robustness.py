@@ -42,7 +42,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.measure.metrics import chamfer_mm, skeleton, volume_dice
 from gcar_deploy.types import Array, Image
 from gcar_export.evaluate.evaluate import find_labels
-from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.labels import LabelVolume, case_stem, read_label
 from gcar_export.scenes.protocols import MM_PER_COUNT
 from gcar_export.scenes.raycast import raycast
 
@@ -152,9 +152,7 @@ def run(
     """
     engine = Engine(model)
     settings = _settings(engine)
-    files = [f for f in find_labels(data) if not cases or f.name.split(".")[0] in cases]
-    if not files:
-        raise UsageError(f"{data}: none of the cases {', '.join(cases)} is there")
+    files = find_labels(data, cases)
     out.mkdir(parents=True, exist_ok=True)
     rows = read_rows(out / "robustness.csv")
     if any(row["settings"] != settings for row in rows):
@@ -163,7 +161,7 @@ def run(
     wanted = [(file, point) for file in files for point in points(curves)]
     tree: LabelVolume | None = None
     for n, (file, point) in enumerate(wanted):
-        name = file.name.split(".")[0]
+        name = case_stem(file)
         if (point.curve, point.level, name) not in done:
             if tree is None or tree.name != name:
                 label = read_label(file)

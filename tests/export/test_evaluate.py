@@ -312,7 +312,8 @@ def test_refusals_are_rows(data, tmp_path, engine, monkeypatch):
 @pytest.mark.parametrize(
     "wrong",
     [{"protocol": "x"}, {"methods": ("x",)}, {"methods": ()}, {"views": (1,)}, {"jobs": 0},
-     {"reference": "hull"}, {"engine": "x"}, {"changed": "x"}, {"redo": ("hull",)}],
+     {"reference": "hull"}, {"engine": "x"}, {"changed": "x"}, {"redo": ("hull",)},
+     {"methods": ("ours", "ours")}, {"views": (2, 2)}, {"cases": ("1", "1")}],
 )  # fmt: skip
 def test_wrong_options_are_usage_errors(tmp_path, wrong):
     good = {"data": tmp_path, "out": tmp_path, "protocol": "paper", "methods": ("ours",)}
@@ -322,6 +323,22 @@ def test_wrong_options_are_usage_errors(tmp_path, wrong):
 
 def test_empty_data_is_a_usage_error(tmp_path):
     with pytest.raises(UsageError):
+        evaluate.find_labels(tmp_path)
+
+
+def test_a_case_is_named_by_all_of_its_file_name_but_the_suffix(tmp_path):
+    for name in ("patient.1.nii.gz", "patient.2.nii.gz", "1.2.840.label.nii.gz"):
+        (tmp_path / name).touch()
+    found = evaluate.find_labels(tmp_path)
+    names = [evaluation_jobs.case_name(path) for path in found]
+    assert names == ["1.2.840", "patient.1", "patient.2"]
+    assert evaluate.find_labels(tmp_path, ("patient.2",)) == [found[2]]
+    with pytest.raises(UsageError, match=r"cases: patient, 9 is not in /"):
+        evaluate.find_labels(tmp_path, ("patient", "patient.1", "9"))
+    (tmp_path / "imagecas").mkdir()
+    (tmp_path / "imagecas" / "patient.1.label.nii.gz").touch()
+    assert len(evaluate.find_labels(tmp_path, ("patient.2",))) == 1
+    with pytest.raises(UsageError, match=r"\.label\.nii\.gz and /.* are both case patient\.1"):
         evaluate.find_labels(tmp_path)
 
 

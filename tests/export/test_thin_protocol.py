@@ -56,7 +56,7 @@ def test_it_needs_no_data_and_says_which_trees_there_are(tmp_path) -> None:
         data=None, out=tmp_path, protocol="thin", methods=("ours",), cases=("99",)
     )
     assert options.protocols == tuple(THIN) and len(thin_names()) == 12
-    with pytest.raises(UsageError, match=r"99 is in 01 \.\. 12"):
+    with pytest.raises(UsageError, match=r"99 is not in 01 \.\. 12"):
         evaluate(options)
     with pytest.raises(UsageError, match="--data is missing"):
         evaluate(EvaluateOptions(data=None, out=tmp_path, protocol="paper", methods=("ours",)))
