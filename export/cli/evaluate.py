@@ -81,7 +81,7 @@ class _Progress:
     type=click.Choice(["redo", "keep", "refuse"]),
     default="redo",
     show_default=True,
-    help="Rows in --out that were made with other settings.",
+    help="Rows in --out that were made with other settings or label files.",
 )
 @click.option("--redo", default="", help="Make the rows of these methods anew in any case.")
 @click.option("--draw-only", is_flag=True, help="Tables and pictures anew from --out/cases.csv.")

@@ -2,14 +2,15 @@
 
 One job is one case, one number of views and one method; its row is written as soon as it
 is done, so an interrupted evaluation goes on where it stopped. Every row remembers the
-settings it was made with: rows of other settings are made anew, or refused, and never mixed
-in unsaid.
+settings and the label file it was made with: rows of others are made anew, or refused, and never
+mixed in unsaid.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import logging
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -34,8 +35,10 @@ LABEL_PATTERNS = (
 )  # fmt: skip
 #: protocols that one word asks for
 GROUPS: Mapping[str, tuple[str, ...]] = {"common": tuple(COMMON), "thin": tuple(THIN)}
-#: what to do with rows that were made with other settings.
+#: what to do with rows that were made with other settings or label files.
 CHANGED = ("redo", "keep", "refuse")
+#: what a row is tied to, in words
+_TIED = ("settings", "label files")
 OnProgress = Callable[[int, int, str], None]
 
 
@@ -143,7 +146,8 @@ def evaluate(
     Raises
     ------
     UsageError
-        No label volume; rows of other settings and ``changed`` is ``refuse``; no cluster.
+        No label volume; rows of other settings or label files and ``changed`` is ``refuse``; no
+        cluster.
     ModelError
         A method's model is missing.
     """
@@ -155,9 +159,11 @@ def evaluate(
         labels = find_labels(_given(options.data), options.cases)
     check_models(options.methods, options.settings)
     digests = {method: options.settings.digest(method) for method in options.methods}
+    data = {label: None if generated else _sha256(label) for label in labels}
     jobs = [
         Job(
-            label=label, protocol=protocol, method=method, views=views, digest=digests[method]
+            label=label, protocol=protocol, method=method, views=views, digest=digests[method],
+            data=data[label],
         )
         for protocol in options.protocols
         for label in labels
@@ -205,17 +211,24 @@ def write_summaries(rows: Sequence[dict[str, Any]], out: Path, reference: str) -
 
 def _missing(jobs: Sequence[Job], options: EvaluateOptions) -> list[Job]:
     """Jobs without a row, and those whose row is out of date, which is said aloud."""
-    missing, changed = [], []
+    missing, changed, others = [], [], set()
     for job in jobs:
         path = row_path(options.out, job)
         if not path.exists() or job.method in options.redo:
             missing.append(job)
-        elif _read(path).get("settings") != job.digest:
+            continue
+        row = _read(path)
+        same = (row.get("settings") == job.digest, row.get("label_sha256") == job.data)
+        if not all(same):
             changed.append(job)
+            others |= {what for what, equal in zip(_TIED, same, strict=True) if not equal}
     if not changed:
         return missing
     methods = ", ".join(dict.fromkeys(job.method for job in changed))
-    said = f"{len(changed)} rows of {methods} in {options.out} were made with other settings"
+    said = (
+        f"{len(changed)} rows of {methods} in {options.out} were made with other "
+        f"{' and '.join(sorted(others, reverse=True))}"
+    )
     if options.changed == "refuse":
         raise UsageError(f"{said}: take another --out, or --changed redo or keep")
     if options.changed == "keep":
@@ -245,6 +258,11 @@ def _write_settings(options: EvaluateOptions) -> None:
             "settings": options.settings.of(method),
         }
     path.write_text(json.dumps(known, indent=1, default=str))
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -45,6 +45,7 @@ class Job:
     label : label volume
     protocol, method, views : what to do with it
     digest : of the method's settings; a row with another one is out of date
+    data : SHA-256 of the label file, likewise; None for a tree that is generated
     """
 
     label: Path
@@ -52,6 +53,7 @@ class Job:
     method: str
     views: int
     digest: str
+    data: str | None
 
     @property
     def case(self) -> str:
@@ -87,7 +89,7 @@ def case_name(label: Path) -> str:
 
 def run_job(job: Job, settings: MethodSettings) -> Done:
     """Make one row."""
-    case = _case(job.label, job.protocol, job.views)
+    case = _case(job.label, job.data, job.protocol, job.views)
     solved = solve(case, job.method, settings)
     found = measure(case, solved)
     row = {
@@ -105,6 +107,7 @@ def run_job(job: Job, settings: MethodSettings) -> Done:
         "cpu_seconds": float(solved.seconds["cpu"]),
         "stages": {s: float(t) for s, t in solved.seconds.items() if s not in ("total", "cpu")},
         "settings": job.digest,
+        "label_sha256": job.data,
     }
     finite = solved.volume is not None and bool(np.isfinite(solved.volume).all())
     return Done(
@@ -200,7 +203,7 @@ def write_done(out: Path, job: Job, done: Done) -> None:
         path = sides_path(out, job.protocol, job.case, job.views, method)
         if sides is None:
             path.unlink(missing_ok=True)
-        elif method != TRUTH or not path.exists():
+        else:
             _replace(path, cv2.imencode(".png", sides)[1].tobytes())
     text = json.dumps(done.row, indent=1, allow_nan=False)
     _replace(row_path(out, job), text.encode())
@@ -212,16 +215,17 @@ def _replace(path: Path, content: bytes) -> None:
     partial.replace(path)
 
 
+# A worker outlives an evaluation: what it keeps is tied to what is in the file.
 @functools.lru_cache(maxsize=1)
-def _label(path: Path) -> LabelVolume:
+def _label(path: Path, data: str | None) -> LabelVolume:
     return read_label(path)
 
 
 @functools.lru_cache(maxsize=1)
-def _case(path: Path, protocol: str, views: int) -> Case:
+def _case(path: Path, data: str | None, protocol: str, views: int) -> Case:
     if protocol in THIN:
         return thin_case(path.name, protocol, views)
-    return make_case(_label(path), protocol, views)
+    return make_case(_label(path, data), protocol, views)
 
 
 def _mean(measures: Sequence[Measure]) -> Measure:

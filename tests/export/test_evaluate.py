@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 import types
 from pathlib import Path
 
@@ -263,6 +264,33 @@ def test_changed_settings_are_redone_kept_or_refused_aloud(data, tmp_path, engin
     calls.clear()
     evaluate.evaluate(again, lambda *a: calls.append(a))
     assert len(calls) == 2
+
+
+@pytest.mark.parametrize("before", ["another file", "no hash"])
+def test_rows_are_tied_to_their_label_file(data, tmp_path, monkeypatch, caplog, before):
+    label = tmp_path / "data" / "1.nii.gz"
+    label.parent.mkdir()
+    shutil.copy(data / "imagecas" / "1.label.nii.gz", label)
+    given = {"data": label.parent, "out": tmp_path / "out", "protocol": "paper",
+             "methods": ("visual_hull",)}  # fmt: skip
+    first = evaluate.evaluate(evaluate.EvaluateOptions(**given))
+    truth = (tmp_path / "out" / "sides" / "paper-1-0-truth.png").read_bytes()
+    if before == "no hash":
+        (file,) = (tmp_path / "out" / "rows").iterdir()
+        file.write_text(json.dumps({k: v for k, v in first[0].items() if k != "label_sha256"}))
+    else:
+        shutil.copy(data / "imagecas" / "2.label.nii.gz", label)
+    with pytest.raises(UsageError, match=r"1 rows of visual_hull .* made with other label files:"):
+        evaluate.evaluate(evaluate.EvaluateOptions(**given, changed="refuse"))
+    kept = evaluate.evaluate(evaluate.EvaluateOptions(**given, changed="keep"))
+    assert kept[0]["measures"] == first[0]["measures"] and "kept as they are" in caplog.text
+    (redone,) = evaluate.evaluate(evaluate.EvaluateOptions(**given))
+    other = before == "another file"
+    assert (redone["measures"] != first[0]["measures"]) == other
+    after = (tmp_path / "out" / "sides" / "paper-1-0-truth.png").read_bytes()
+    assert (after != truth) == other
+    caplog.clear()
+    evaluate.evaluate(evaluate.EvaluateOptions(**given, changed="refuse"))
 
 
 def test_rows_depend_on_their_own_settings_alone():
