@@ -32,18 +32,18 @@ def pose(angiograms: Sequence[Angiogram], grid: Grid) -> Seen:
     return seen_by_all(views, grid, options)
 
 
-def predicted(predictor: Predictor, posed: Seen) -> dict[str, Points]:
-    """Predicted centres, (n, 3) mm LPS each, by the name of their row.
+def predicted(predictor: Predictor, posed: Seen) -> Points:
+    """Predicted centres, (n, 3) mm LPS.
 
     ``multi``: hull points decided to be vessel, moved by their offset to the centreline.
     ``paper``: what each view says on its own, lifted along its rays, all views together.
     """
     if isinstance(predictor, SingleViewPredictor):
         alone = predictor.predict([(v.carm, v.path_mm) for v in posed.views])
-        return {"paper": np.concatenate([view.points_mm for view in alone])}
+        return np.concatenate([view.points_mm for view in alone])
     error = max(view.path_error for view in posed.views)
     found = decide(predictor.predict(posed.hull, posed.encoded), posed.encoded, error)
-    return {"multi": line_votes(found).points_mm[found.confidence >= 0.5]}
+    return line_votes(found).points_mm[found.confidence >= 0.5]
 
 
 def depth_error_px(predictor: SingleViewPredictor, posed: Seen, tree: Capsules) -> float:

@@ -28,12 +28,11 @@ from gcar_export.studies.centers import Truth, depth_error_px, pose, predicted
 
 #: how near counts, voxels of the protocol's grid (1.41 mm paper, 1 mm clinical)
 REACH_VOXELS = 1.5
-ORDER = ("multi", "paper")
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One predictor on one tree: shares of centres and of centreline, 0 .. 1.
+    """One model on one tree: shares of centres and of centreline, 0 .. 1.
 
     ``depth_px`` is the median error of depth, pixel edges, for predictors of single views.
     """
@@ -52,7 +51,7 @@ class Cost:
 
     Attributes
     ----------
-    name : multi or single
+    name : of the model, as ``open_models`` gives it
     pairs : inference over one itk-rtk forward and back projection (128^3 voxels, two 128 x 128
         views), wall-clock
     cpu_pairs : the same of processor seconds, which other load on the machine hardly touches
@@ -68,29 +67,44 @@ class Cost:
     peak_mib: float
 
 
-def open_models(names: Sequence[str]) -> list[tuple[Path, Predictor]]:
-    """Open shipped models by kind (``multi``, ``single``) or any by path.
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A predictor that is open, its file, and the name that its rows have."""
+
+    name: str
+    path: Path
+    predictor: Predictor
+
+
+def open_models(names: Sequence[str]) -> list[Model]:
+    """Open shipped models by kind (``multi``, ``paper``) or any by path.
+
+    One by path is named by its file, by its path where two files are named alike.
 
     Raises
     ------
     UsageError
-        A kind has no shipped model.
+        A kind has no shipped model, or one model is named twice.
     ModelError
         A file is missing or altered.
     """
     out = []
-    for name in names:
+    files = [Path(name).name for name in names]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise UsageError(f"models: {name} is named twice")
         path = PREDICTORS[name].path if name in PREDICTORS else Path(name)
         if path is None:
             raise UsageError(f"no {name} model is installed; give the path of one")
-        out.append((path, open_predictor(read_predictor(path))))
+        label = files[k] if files.count(files[k]) == 1 else name
+        out.append(Model(name=label, path=path, predictor=open_predictor(read_predictor(path))))
     return out
 
 
 def measure(
     data: Path,
     protocol: str,
-    models: Sequence[tuple[Path, Predictor]],
+    models: Sequence[Model],
     cases: Sequence[str] = (),
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Row]:
@@ -101,13 +115,13 @@ def measure(
         case = make_case(read_label(file), protocol)
         posed, truth = pose(case.angiograms(), case.grid), Truth.of(case.truth, case.grid)
         reach = REACH_VOXELS * float(np.mean(case.grid.spacing_mm))
-        for _, predictor in models:
+        for model in models:
             depth = None
-            if isinstance(predictor, SingleViewPredictor):
-                depth = depth_error_px(predictor, posed, capsules_of(case.label))
-            for name, centers in predicted(predictor, posed).items():
-                precision, recall = truth.scores(centers, reach)
-                rows.append(Row(case.name, name, precision, recall, len(centers), depth))
+            if isinstance(model.predictor, SingleViewPredictor):
+                depth = depth_error_px(model.predictor, posed, capsules_of(case.label))
+            centers = predicted(model.predictor, posed)
+            precision, recall = truth.scores(centers, reach)
+            rows.append(Row(case.name, model.name, precision, recall, len(centers), depth))
         if progress:
             progress(done + 1, len(files), case.name)
     return rows
@@ -116,7 +130,7 @@ def measure(
 def cost(
     data: Path,
     protocol: str,
-    models: Sequence[tuple[Path, Predictor]],
+    models: Sequence[Model],
     cases: Sequence[str] = (),
     repeats: int = 7,
 ) -> list[Cost]:
@@ -125,8 +139,8 @@ def cost(
     case = make_case(read_label(files[0]), protocol)
     posed = pose(case.angiograms(), case.grid)
     work = {"pair": _pair(case)}
-    for _, predictor in models:
-        work[predictor.model.kind] = _inference(predictor, posed)
+    for model in models:
+        work[model.name] = _inference(model.predictor, posed)
     wall: dict[str, list[float]] = {name: [] for name in work}
     cpu: dict[str, list[float]] = {name: [] for name in work}
     for round_ in range(repeats + 1):
@@ -141,14 +155,14 @@ def cost(
     )
     return [
         Cost(
-            name=p.model.kind,
-            pairs=seconds[p.model.kind] / seconds["pair"],
-            cpu_pairs=processor[p.model.kind] / processor["pair"],
-            seconds=seconds[p.model.kind],
+            name=model.name,
+            pairs=seconds[model.name] / seconds["pair"],
+            cpu_pairs=processor[model.name] / processor["pair"],
+            seconds=seconds[model.name],
             pair_seconds=seconds["pair"],
-            peak_mib=peak_mib(path, _feed(p, posed)),
+            peak_mib=peak_mib(model.path, _feed(model.predictor, posed)),
         )
-        for path, p in models
+        for model in models
     ]
 
 
@@ -186,7 +200,7 @@ def table(rows: Sequence[Row], costs: Sequence[Cost], protocol: str) -> str:
         "| lowest .. highest | centres | depth off by, pixels |",
         "|---|---|---|---|---|---|",
     ]
-    for name in [n for n in ORDER if any(r.name == n for r in rows)]:
+    for name in dict.fromkeys(row.name for row in rows):
         own = [r for r in rows if r.name == name]
         p, r = (100 * np.array([getattr(x, k) for x in own]) for k in ("precision", "recall"))
         spread = 1 if len(own) > 1 else 0

@@ -1,5 +1,6 @@
 """Scores of predicted centres in closed form, the table on a real tree, memory of a process."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from gcar_export.cli.main import main
 from gcar_export.methods.predictor_process import peak_mib
 from gcar_export.scenes.capsules import Capsules
 from gcar_export.shipping.golden import golden_inputs
+from gcar_export.studies import centers_table
 from gcar_export.studies.centers import Truth, depth_error_px
 from gcar_export.studies.centers_table import Cost, Row, open_models, table
 from tests.conftest import data_dir
@@ -54,7 +56,7 @@ def test_table_has_a_row_per_predictor_and_its_cost():
     assert "| multi (n=1) | 100.0 ± 0.0 | 100.0 ± 0.0 |" in text
     line = "| paper (n=2) | 60.0 ± 14.1 | 50.0 ± 35.4 | 50.0 .. 70.0 / 25.0 .. 75.0 | 100 "
     assert f"{line}| 7.0 (6.0 .. 8.0) |" in text
-    assert text.index("| multi (n=1)") < text.index("| paper (n=2)")
+    assert text.index("| paper (n=2)") < text.index("| multi (n=1)")
     assert "| multi | 1.50 | 1.25 | 0.300 | 0.200 | 230 |" in text
 
 
@@ -72,13 +74,49 @@ def test_depth_that_is_off_by_so_much_is_said_to_be():
 
 
 def test_models_by_kind_or_path(monkeypatch, tmp_path):
-    (path, predictor), = open_models([str(TINY)])  # fmt: skip
-    assert path == TINY and predictor.model.kind == "paper"
+    (model,) = open_models([str(TINY)])
+    assert model.path == TINY and model.predictor.model.kind == "paper"
     with pytest.raises(ModelError, match=r"none\.onnx"):
         open_models([str(tmp_path / "none.onnx")])
     monkeypatch.setattr("gcar_deploy.models.spec.shipped_model_path", lambda name: None)
     with pytest.raises(UsageError, match="no paper model is installed"):
         open_models(["paper"])
+
+
+def test_models_of_one_kind_have_rows_of_their_own(monkeypatch, tmp_path):
+    own = tmp_path / "own.onnx"
+    again = tmp_path / TINY.name
+    for copy in (own, again):
+        for suffix in (".onnx", ".json"):
+            copy.with_suffix(suffix).write_bytes(TINY.with_suffix(suffix).read_bytes())
+    models = open_models(["paper", str(own)])
+    assert [model.name for model in models] == ["paper", "own.onnx"]
+    assert {model.predictor.model.kind for model in models} == {"paper"}
+    alike = open_models([str(TINY), str(again)])
+    assert [model.name for model in alike] == [str(TINY), str(again)]
+    with pytest.raises(UsageError, match="models: paper is named twice"):
+        open_models(["paper", "paper"])
+    monkeypatch.setattr(centers_table, "find_labels", lambda data, cases: [Path("a")])
+    monkeypatch.setattr(centers_table, "read_label", lambda path: path)
+    case = SimpleNamespace(name="a", truth=None, label=None, grid=GRID, angiograms=list)
+    monkeypatch.setattr(centers_table, "make_case", lambda *_: case)
+    monkeypatch.setattr(centers_table, "pose", lambda *_: None)
+    monkeypatch.setattr(centers_table, "capsules_of", lambda _: None)
+    monkeypatch.setattr(centers_table, "depth_error_px", lambda *_: 1.0)
+    monkeypatch.setattr(centers_table, "_pair", lambda _: lambda: None)
+    monkeypatch.setattr(centers_table, "_inference", lambda *_: lambda: None)
+    monkeypatch.setattr(centers_table, "_feed", lambda *_: {})
+    monkeypatch.setattr(centers_table, "peak_mib", lambda path, _: len(path.name))
+    centers = {id(m.predictor): np.zeros((k + 1, 3)) for k, m in enumerate(models)}
+    monkeypatch.setattr(centers_table, "predicted", lambda predictor, _: centers[id(predictor)])
+    scores = SimpleNamespace(scores=lambda *_: (1.0, 1.0))
+    monkeypatch.setattr(centers_table, "Truth", SimpleNamespace(of=lambda *_: scores))
+    rows = centers_table.measure(Path(), "paper", models)
+    assert [(row.name, row.centers) for row in rows] == [("paper", 1), ("own.onnx", 2)]
+    costs = centers_table.cost(Path(), "paper", models)
+    assert [cost.name for cost in costs] == ["paper", "own.onnx"]
+    text = table(rows, costs, "paper")
+    assert text.count("| paper ") == 2 and text.count("| own.onnx ") == 2
 
 
 def test_a_process_with_only_the_predictor_stays_small():
