@@ -29,6 +29,7 @@ from gcar_export.training.dataset import PATH_CELLS, training_scene
 from gcar_export.training.examinations import FINE_CELLS_MM, PAPER_CELLS_MM
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
+from gcar_export.training.warm_start import license_of
 
 OPSET = 18
 IR_VERSION = 10
@@ -147,7 +148,6 @@ def _trace_unet(net: UNetPredictor) -> Any:
 def _spec(
     net: DeployedSparse | UNetPredictor, manifest: dict[str, Any], name: str
 ) -> dict[str, Any]:
-    labels = manifest.get("labels")
     spec: dict[str, Any] = {
         "schema": "gcar-model/1",
         "name": name,
@@ -155,9 +155,7 @@ def _spec(
         "ir_version": IR_VERSION,
         "precision": "float32",
         "training": manifest,
-        "license": "Apache-2.0; trained on generated trees alone"
-        if not labels
-        else "that of the label volumes named in training.labels",
+        "license": license_of(manifest),
         "parameters": sum(p.numel() for p in net.parameters()),
     }
     if isinstance(net, DeployedSparse):

@@ -32,7 +32,7 @@ from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.run_folder import ProgressLine, RunFolder
 from gcar_export.training.scene_stream import in_order
-from gcar_export.training.warm_start import predictor_of
+from gcar_export.training.warm_start import inherited, predictor_of
 
 #: scenes with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_001
@@ -308,6 +308,10 @@ def _first_network(job: _Job) -> SparsePredictor:
 
 
 def _run_folder(job: _Job) -> RunFolder:
+    before: dict[str, Any] = {"warm_start": None}
+    if job.warm_start is not None:
+        before = inherited(predictor_of(job.warm_start)[1])
+    labelled = job.labels or before.get("labels_before")
     return RunFolder(
         job.out,
         {
@@ -317,8 +321,8 @@ def _run_folder(job: _Job) -> RunFolder:
             "options": dataclasses.asdict(job.options),
             "scenes": dataclasses.asdict(SceneOptions()),
             "labels": dict(job.label_hashes),
-            "warm_start": None if job.warm_start is None else predictor_of(job.warm_start)[1],
-            "data": f"{'generated trees and label volumes' if job.labels else GENERATED}: "
+            **before,
+            "data": f"{'generated trees and label volumes' if labelled else GENERATED}: "
             "scene step * replicas + rank of the seed",
             "validation_seed": VALIDATION_SEED,
         },

@@ -6,6 +6,7 @@ all views at once: their product with a transposed copy is found through the bia
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,51 @@ import numpy as np
 import torch
 
 from gcar_deploy.errors import ModelError
-from gcar_deploy.models.spec import read_model
+from gcar_deploy.models.spec import ModelFile, read_model
 from gcar_deploy.predict.kinds import MULTI
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 
 _PREFIX = "net."
+#: licence of what was trained on no label volume
+OWN_LICENSE = "Apache-2.0; trained on generated trees alone"
+#: keys of a manifest that name label volumes: its own, and those behind its first weights
+_LABELS = ("labels", "labels_before")
 
 
-def predictor_of(model: Path) -> tuple[SparsePredictor, str]:
-    """Return the network that a model file was exported from, and the file's SHA-256.
+def license_of(training: Mapping[str, Any]) -> str:
+    """Return the licence of what was trained as this manifest says.
+
+    What its first weights brought along holds for it as well (``inherited``).
+    """
+    named = [f"training.{key}" for key in _LABELS if training.get(key)]
+    terms = [f"that of the label volumes named in {' and '.join(named)}"] if named else []
+    return "; ".join([*terms, *training.get("licenses_before", ())]) or OWN_LICENSE
+
+
+def inherited(model: ModelFile) -> dict[str, Any]:
+    """Return what a training that begins from a model has to keep in its manifest.
+
+    Returns
+    -------
+    ``warm_start``: SHA-256 of the file; ``labels_before``: name to SHA-256 of all label volumes
+    that it and the models before it were trained on; ``licenses_before``: terms that do not follow
+    from these
+    """
+    training = model.spec.get("training", {})
+    labels: dict[str, str] = {}
+    for key in _LABELS:
+        for name, digest in (training.get(key) or {}).items():
+            same = labels.get(name, digest) == digest
+            labels[name if same else f"{name} ({digest[:8]})"] = digest
+    terms = list(training.get("licenses_before", ()))
+    told = str(model.spec.get("license", OWN_LICENSE))
+    if told not in (license_of(training), *terms):
+        terms.append(told)
+    return {"warm_start": model.sha256, "labels_before": labels, "licenses_before": terms}
+
+
+def predictor_of(model: Path) -> tuple[SparsePredictor, ModelFile]:
+    """Return the network that a model file was exported from, and the file.
 
     Raises
     ------
@@ -38,7 +75,7 @@ def predictor_of(model: Path) -> tuple[SparsePredictor, str]:
         raise ModelError(f"{model.name} does not say which network it holds") from None
     graph = onnx.load_from_string(file.data).graph
     net.load_state_dict({name: _weight(graph, name, net) for name in net.state_dict()})
-    return net, str(file.sha256)
+    return net, file
 
 
 def _weight(graph: Any, name: str, net: SparsePredictor) -> torch.Tensor:

@@ -30,8 +30,9 @@ def card(model: ModelFile) -> list[str]:
         f"{training.get('seed', training.get('options', {}).get('seed', '?'))}, "
         f"{training.get('step', '?')} steps",
     ]
-    for name, digest in training.get("labels", {}).items():
-        out.append(f"    label volume {name} {digest[:12]}")
+    for key, whose in (("labels", ""), ("labels_before", ", of its first weights")):
+        for name, digest in (training.get(key) or {}).items():
+            out.append(f"    label volume {name} {digest[:12]}{whose}")
     for kind, scores in training.get("validation", {}).items():
         shown = ", ".join(f"{key} {value:.3f}" for key, value in scores.items())
         out.append(f"  {kind}, generated and held out: {shown}")

@@ -2,9 +2,11 @@
 
 import dataclasses
 import functools
+import json
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import cv2
@@ -13,13 +15,15 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from gcar_deploy.cli.model_card import card
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_deploy.models.session import Session
 from gcar_deploy.models.spec import read_model, shipped_model_path
 from gcar_deploy.predict.encoding import flat_inputs, input_names
 from gcar_deploy.predict.kinds import MULTI
-from gcar_export.shipping.export_onnx import DeployedSparse
+from gcar_export.shipping.export_onnx import DeployedSparse, _spec
 from gcar_export.shipping.tiny_model import TINY
+from gcar_export.training import multi
 from gcar_export.training.dataset import training_scene
 from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.multi import (
@@ -34,6 +38,7 @@ from gcar_export.training.multi import (
 from gcar_export.training.networks.sparse import SparsePredictor
 from gcar_export.training.run_folder import load_weights
 from gcar_export.training.scene_stream import in_order
+from gcar_export.training.warm_start import OWN_LICENSE, license_of
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -200,6 +205,44 @@ def test_a_training_may_begin_from_a_model(tmp_path):
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
     with pytest.raises(UsageError, match="warm_start"):
         train(tmp_path, PRESETS["tiny"], CONFIGS["cpu"], until=0.0)
+
+
+def _generation(folder, parent, monkeypatch, labels=None):
+    """Card of a model that was trained on from another one."""
+    file = types.SimpleNamespace(spec=parent, sha256="0" * 64, kind="multi")
+    monkeypatch.setattr(multi, "predictor_of", lambda _: (SparsePredictor(TINY), file))
+    train(folder, PRESETS["tiny"], TINY, until=0.0, warm_start=folder, labels=[None] * bool(labels),
+          label_hashes=labels)  # fmt: skip
+    manifest = json.loads((folder / "manifest.json").read_text())
+    return _spec(DeployedSparse(SparsePredictor(TINY)), manifest, "m")
+
+
+def test_what_the_first_weights_were_trained_on_stays_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(multi, "training_scene", lambda *a, **k: None)  # no step is taken
+    parent = {"training": {"labels": {"a": "1" * 64}}}
+    parent["license"] = license_of(parent["training"])
+    assert parent["license"] == "that of the label volumes named in training.labels"
+    child = _generation(tmp_path / "one", parent, monkeypatch)
+    assert child["license"] == "that of the label volumes named in training.labels_before"
+    assert child["training"]["labels_before"] == {"a": "1" * 64}
+    assert child["training"]["data"].startswith("generated trees and label volumes")
+    file = types.SimpleNamespace(
+        spec=child, name="m", sha256="0", kind="multi", data=b"", inputs={}
+    )
+    assert "label volume a 111111111111, of its first weights" in "\n".join(card(file))
+    # terms that somebody wrote into a card go on as they are
+    child["license"] = "CC-BY-NC-4.0"
+    second = _generation(tmp_path / "two", child, monkeypatch, {"a": "2" * 64})
+    both = "that of the label volumes named in training.labels and training.labels_before"
+    assert second["license"] == f"{both}; CC-BY-NC-4.0"
+    third = _generation(tmp_path / "three", second, monkeypatch)
+    assert third["license"] == (
+        "that of the label volumes named in training.labels_before; CC-BY-NC-4.0"
+    )
+    kept = third["training"]["labels_before"]
+    assert kept == {"a": "2" * 64, "a (11111111)": "1" * 64}
+    plain = _generation(tmp_path / "plain", {"license": OWN_LICENSE}, monkeypatch)
+    assert plain["license"] == OWN_LICENSE
 
 
 def test_a_warm_start_of_another_size_is_refused(tmp_path):
