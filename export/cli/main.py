@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import click
 
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_export.cli.centers import centers_table, robustness
-from gcar_export.cli.devices import train_devices
 from gcar_export.cli.evaluate import converge, evaluate, paper_page
 from gcar_export.cli.frames import frame_pairs
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
+from gcar_export.cli.models import export, export_segmenter, golden, verify
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table, speed_table
+from gcar_export.cli.training import train, train_devices, train_segmenter
 from gcar_export.cli.wrong_scenes import wrong_scenes
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-_REPLACE = click.option("--force", is_flag=True, help="Replace a model that is there.")
-
-
-def _check_free(out: Path, force: bool) -> None:
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists; add --force to replace it")
 
 
 class _Group(click.Group):
@@ -128,116 +121,6 @@ def pair_time(label: Path, repeats: int) -> None:
     click.echo(f"ratio {found.ratio:.2f} (medians of {found.repeats})")
 
 
-@main.command()
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
-@click.option(
-    "--network",
-    type=click.Choice(["multi", "paper"]),
-    default="multi",
-    show_default=True,
-    help="The predictor that sees all views, or the paper's that sees one.",
-)
-@click.option(
-    "--preset", type=click.Choice(["cpu", "gpu", "tune", "tiny"]), default="cpu", show_default=True
-)
-@click.option("--steps", type=click.IntRange(1), help="Steps in all; overrides the preset.")
-@click.option("--decay-steps", type=click.IntRange(1), help="Length of the final linear decay.")
-@click.option(
-    "--minutes", type=click.FloatRange(0), help="Stop after so long; the same command goes on."
-)
-@click.option(
-    "--labels",
-    type=_FOLDER,
-    help="Label volumes of your own (.nii, .nii.gz, .nrrd, .mha, .mhd): half of the scenes.",
-)
-@click.option(
-    "--learning-rate", type=click.FloatRange(0, 1, min_open=True), help="The preset's otherwise."
-)
-@click.option(
-    "--seed", type=click.IntRange(1), help="Of the scenes; a tuning wants another than its model's."
-)
-@click.option("--warm-start", type=_FILE, help="Go on from the weights of this model (.onnx).")
-def train(
-    out: Path,
-    network: str,
-    preset: str,
-    steps: int | None,
-    decay_steps: int | None,
-    minutes: float | None,
-    labels: Path | None,
-    learning_rate: float | None,
-    seed: int | None,
-    warm_start: Path | None,
-) -> None:
-    """Train a predictor on generated trees; stop and go on at will.
-
-    Example: gcar-export train --network paper --out runs/a --minutes 60
-    """
-    from gcar_export.training.train import start
-
-    start(
-        out, network, preset, steps=steps, decay_steps=decay_steps, minutes=minutes, labels=labels,
-        learning_rate=learning_rate, seed=seed, warm_start=warm_start,
-    )  # fmt: skip
-
-
-@main.command()
-@click.argument("checkpoint", type=_FILE)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-@click.option(
-    "--inputs", type=click.IntRange(1), default=60, show_default=True, help="For the parity check."
-)
-@click.option("--int8", is_flag=True, help="Also try OUT-int8.onnx, kept if the task allows it.")
-@_REPLACE
-def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) -> None:
-    """Turn CHECKPOINT (.safetensors) into one ONNX file with its spec, and prove it.
-
-    Example: gcar-export export runs/a/checkpoint.safetensors --out models/gcp-multi.onnx
-    """
-    from gcar_export.shipping.parity import export_checked
-
-    _check_free(out, force)
-    found = export_checked(checkpoint, out, inputs)
-    click.echo(
-        f"{out}: {found.inputs} inputs, largest difference {found.worst:.1e} of the range, "
-        f"{found.decisions_equal:.4%} of decisions equal; task: Dice {found.task_torch:.4f} with "
-        f"torch, {found.task_runtime:.4f} through the runtime"
-    )
-    if int8:
-        from gcar_export.shipping.quantize import quantize_checked
-
-        click.echo(quantize_checked(out))
-
-
-@main.command()
-@click.argument("model", type=_FILE)
-@click.option("--scenes", default=12, show_default=True, help="Generated scenes to run.")
-def verify(model: Path, scenes: int) -> None:
-    """Check a model file against its spec and run it through the runtime's own predictor.
-
-    Example: gcar-export verify models/gcp-multi.onnx
-    """
-    from gcar_export.shipping.verify import verify_model
-
-    click.echo(verify_model(model, scenes))
-
-
-@main.command()
-@click.argument("model", type=_FILE)
-@click.option("--force", is_flag=True, help="Replace an existing golden case.")
-def golden(model: Path, force: bool) -> None:
-    """Write MODEL's golden case: a small input, and what the model says to it today.
-
-    It is run whenever the model is loaded; another answer is refused.
-
-    Example: gcar-export golden models/gcp-multi.onnx
-    """
-    from gcar_export.shipping.golden import write_golden
-
-    path = write_golden(model, force=force)
-    click.echo(f"{path}: {path.stat().st_size} bytes")
-
-
 @main.command("tree-table")
 @click.option(
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
@@ -319,7 +202,13 @@ for _verb in (
     gate_table,
     wrong_scenes,
     frame_pairs,
+    train,
+    train_segmenter,
     train_devices,
+    export,
+    export_segmenter,
+    verify,
+    golden,
     ghost_fit,
     status_table,
 ):
@@ -363,58 +252,3 @@ def pose_table(trees: int, out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     rows = study.measure(out, trees, progress=lambda text: click.echo(text, err=True))
     click.echo(study.markdown(rows))
-
-
-@main.command("train-segmenter")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
-@click.option("--preset", type=click.Choice(["cpu", "gpu"]), default="cpu", show_default=True)
-@click.option("--steps", type=int, help="Steps in all.")
-@click.option("--decay-steps", type=int, help="Length of the final decay.")
-@click.option("--warmup-steps", type=int, help="Length of the rise at the start.")
-@click.option("--batch", type=int, help="Pictures of a step.")
-@click.option("--learning-rate", type=float)
-@click.option("--seed", type=int, help="Of the generated pictures and the crops.")
-@click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
-@click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
-@click.option("--folds", type=int, help="Train as many beside it, each without one such part.")
-@click.option("--real-share", type=float, help="Of the pictures of a step, where there are any.")
-@click.option("--pictures", type=int, help="Generated ones that are drawn; each is used often.")
-@click.option(
-    "--pool", type=click.Path(path_type=Path), help="Folder that keeps them, for several runs."
-)
-@click.option("--warm-start", type=_FILE, help="Checkpoint or ONNX model to begin with.")
-@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
-def train_segmenter(
-    out: Path, preset: str, warm_start: Path | None, pool: Path | None, minutes: float | None,
-    **given: Any,
-) -> None:  # fmt: skip
-    """Train the segmentation network on generated and real angiograms; stop and go on at will.
-
-    Options that are not given are those of the preset: two CPU cores for an hour, or a GPU.
-
-    Example: gcar-export train-segmenter --out runs/s --real xca_masks --fold 1/5 --minutes 45
-    """
-    from gcar_export.training import segmenter as training
-
-    options = training.chosen(preset, {k: v for k, v in given.items() if v is not None})
-    workers = (os.cpu_count() or 1) if options.device != "cpu" else 1
-    training.train(out, options, minutes=minutes, workers=workers, begin_from=warm_start, pool=pool)
-
-
-@main.command("export-segmenter")
-@click.argument("checkpoint", type=_FILE)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-@click.option("--devices", type=_FILE, help="Of train-devices, or a model that has one: goes in.")
-@_REPLACE
-def export_segmenter(checkpoint: Path, out: Path, devices: Path | None, force: bool) -> None:
-    """Turn the segmentation network's CHECKPOINT into one ONNX file with its spec, and prove it.
-
-    CHECKPOINT may be an ONNX model, whose segmenter is taken as it is.
-
-    Example: gcar-export export-segmenter runs/s/checkpoint.safetensors --out segmenter.onnx
-    """
-    from gcar_export.shipping import export_segmenter as exporting
-
-    _check_free(out, force)
-    worst = exporting.export_segmenter(checkpoint, out, devices=devices)
-    click.echo(f"{out}: largest difference of a probability {worst:.1e}")

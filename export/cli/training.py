@@ -1,0 +1,132 @@
+"""The verbs that train: a predictor, the segmenter, the network of catheters, leads and wires."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
+@click.option(
+    "--network",
+    type=click.Choice(["multi", "paper"]),
+    default="multi",
+    show_default=True,
+    help="The predictor that sees all views, or the paper's that sees one.",
+)
+@click.option(
+    "--preset", type=click.Choice(["cpu", "gpu", "tune", "tiny"]), default="cpu", show_default=True
+)
+@click.option("--steps", type=click.IntRange(1), help="Steps in all; overrides the preset.")
+@click.option("--decay-steps", type=click.IntRange(1), help="Length of the final linear decay.")
+@click.option(
+    "--minutes", type=click.FloatRange(0), help="Stop after so long; the same command goes on."
+)
+@click.option(
+    "--labels",
+    type=_FOLDER,
+    help="Label volumes of your own (.nii, .nii.gz, .nrrd, .mha, .mhd): half of the scenes.",
+)
+@click.option(
+    "--learning-rate", type=click.FloatRange(0, 1, min_open=True), help="The preset's otherwise."
+)
+@click.option(
+    "--seed", type=click.IntRange(1), help="Of the scenes; a tuning wants another than its model's."
+)
+@click.option("--warm-start", type=_FILE, help="Go on from the weights of this model (.onnx).")
+def train(
+    out: Path,
+    network: str,
+    preset: str,
+    steps: int | None,
+    decay_steps: int | None,
+    minutes: float | None,
+    labels: Path | None,
+    learning_rate: float | None,
+    seed: int | None,
+    warm_start: Path | None,
+) -> None:
+    """Train a predictor on generated trees; stop and go on at will.
+
+    Example: gcar-export train --network paper --out runs/a --minutes 60
+    """
+    from gcar_export.training.train import start
+
+    start(
+        out, network, preset, steps=steps, decay_steps=decay_steps, minutes=minutes, labels=labels,
+        learning_rate=learning_rate, seed=seed, warm_start=warm_start,
+    )  # fmt: skip
+
+
+@click.command("train-segmenter")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
+@click.option("--preset", type=click.Choice(["cpu", "gpu"]), default="cpu", show_default=True)
+@click.option("--steps", type=int, help="Steps in all.")
+@click.option("--decay-steps", type=int, help="Length of the final decay.")
+@click.option("--warmup-steps", type=int, help="Length of the rise at the start.")
+@click.option("--batch", type=int, help="Pictures of a step.")
+@click.option("--learning-rate", type=float)
+@click.option("--seed", type=int, help="Of the generated pictures and the crops.")
+@click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
+@click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
+@click.option("--folds", type=int, help="Train as many beside it, each without one such part.")
+@click.option("--real-share", type=float, help="Of the pictures of a step, where there are any.")
+@click.option("--pictures", type=int, help="Generated ones that are drawn; each is used often.")
+@click.option(
+    "--pool", type=click.Path(path_type=Path), help="Folder that keeps them, for several runs."
+)
+@click.option("--warm-start", type=_FILE, help="Checkpoint or ONNX model to begin with.")
+@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
+def train_segmenter(
+    out: Path, preset: str, warm_start: Path | None, pool: Path | None, minutes: float | None,
+    **given: Any,
+) -> None:  # fmt: skip
+    """Train the segmentation network on generated and real angiograms; stop and go on at will.
+
+    Options that are not given are those of the preset: two CPU cores for an hour, or a GPU.
+
+    Example: gcar-export train-segmenter --out runs/s --real xca_masks --fold 1/5 --minutes 45
+    """
+    from gcar_export.training import segmenter as training
+
+    options = training.chosen(preset, {k: v for k, v in given.items() if v is not None})
+    workers = (os.cpu_count() or 1) if options.device != "cpu" else 1
+    training.train(out, options, minutes=minutes, workers=workers, begin_from=warm_start, pool=pool)
+
+
+@click.command("train-devices")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the run.")
+@click.option("--steps", type=click.IntRange(1), help="Steps in all.")
+@click.option("--decay-steps", type=click.IntRange(1), help="Length of the final decay.")
+@click.option("--batch", type=click.IntRange(1), help="Pictures of a step.")
+@click.option("--learning-rate", type=float)
+@click.option("--seed", type=int, help="Of the pictures.")
+@click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
+@click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
+@click.option("--pictures", type=click.IntRange(1), help="That are drawn; each is used often.")
+@click.option(
+    "--pool", type=click.Path(path_type=Path), help="Folder that keeps them, for several runs."
+)
+@click.option("--warm-start", type=_FILE, help="ONNX model whose device network goes on.")
+@click.option("--minutes", type=float, help="Stop after so long; the same command goes on.")
+def train_devices(
+    out: Path, pool: Path | None, warm_start: Path | None, minutes: float | None, **given: Any
+) -> None:
+    """Train the network that tells catheters, leads and wires along lines; stop and go on at will.
+
+    It looks along the lines that the segmenter that comes along finds, which stays as it is.
+    Without options: one CPU core for two hours, most of them to draw pictures; none are real.
+
+    Example: gcar-export train-devices --out runs/d --real xca_masks --pictures 3400
+    """
+    from gcar_export.training import devices as training
+
+    options = training.chosen({k: v for k, v in given.items() if v is not None})
+    training.train(out, options, minutes=minutes, pool=pool, begin_from=warm_start)
