@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from gcar_export.cli.evaluate import words
+from gcar_export.cli.options import OUT_FOLDER
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _CASES = click.option("--cases", default="", help="Only these cases, comma-separated.")
@@ -53,7 +54,7 @@ def centers_table(data: Path, protocol: str, models: str, cases: str, no_cost: b
 @click.option(
     "--model", type=click.Path(path_type=Path), help="ONNX file; the shipped one without."
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="CSV, PNG, table.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="CSV, PNG, table.")
 def robustness(data: Path, cases: str, curves: str, model: Path | None, out: Path) -> None:
     """Curves over separation, geometry error and mask noise, through the whole reconstruction.
 

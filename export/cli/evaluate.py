@@ -9,15 +9,15 @@ from typing import Any
 import click
 
 from gcar_deploy.errors import UsageError
+from gcar_export.cli.options import COUNT, OUT_FOLDER
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
-_OUT = click.Path(path_type=Path)
 _SET_UPS = ["paper", "clinical", "moved", "raw"]
 _PROTOCOL = click.option(
     "--protocol", type=click.Choice(_SET_UPS), default="paper", show_default=True
 )
 _PAPER_STEPS = click.option(
-    "--paper-steps", type=int, help="Steps of the paper's refinement in all rows that use it."
+    "--paper-steps", type=COUNT, help="Steps of the paper's refinement in all rows that use it."
 )
 
 
@@ -64,8 +64,8 @@ class _Progress:
     help="Comma-separated; the first is the one the others are tested against. 'help' lists all.",
 )
 @click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
-@click.option("--out", type=_OUT, required=True, help="Rows, tables, pictures, report.")
-@click.option("--jobs", default=1, show_default=True, help="Processes on this machine.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Rows, tables, pictures, report.")
+@click.option("--jobs", type=COUNT, default=1, show_default=True, help="Processes on this machine.")
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
 @_PAPER_STEPS
 @click.option(
@@ -156,10 +156,10 @@ def evaluate(
 @_PROTOCOL
 @click.option("--methods", default="nerp,3dgr-fbp", show_default=True, help="Comma-separated.")
 @click.option("--steps", default="25,50,100,200,400", show_default=True, help="Budgets.")
-@click.option("--views", default=2, show_default=True, help="2 .. 16")
+@click.option("--views", type=click.IntRange(2, 16), default=2, show_default=True)
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
-@click.option("--out", type=_OUT, required=True, help="Rows, converge.csv, converge.png.")
-@click.option("--jobs", default=1, show_default=True, help="Processes on this machine.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Rows, converge.csv, converge.png.")
+@click.option("--jobs", type=COUNT, default=1, show_default=True, help="Processes on this machine.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def converge(
     data: Path,
@@ -201,10 +201,10 @@ def converge(
 
 @click.command("paper-page")
 @click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/ and asoca/.")
-@click.option("--out", type=_OUT, required=True, help="Rows, paper.md, paper-views.png.")
-@click.option("--paper-steps", type=int, help="Most iterations; the printed 8,000 without.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Rows, paper.md, paper-views.png.")
+@click.option("--paper-steps", type=COUNT, help="Most iterations; the printed 8,000 without.")
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
-@click.option("--jobs", default=1, show_default=True, help="Processes on this machine.")
+@click.option("--jobs", type=COUNT, default=1, show_default=True, help="Processes on this machine.")
 @click.option("--draw-only", is_flag=True, help="Run nothing; draw what is there.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def paper_page(

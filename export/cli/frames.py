@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import click
 
+from gcar_export.cli.options import COUNT, SEED
+
 
 @click.command("frame-pairs")
 @click.option(
-    "--patients", default=10, show_default=True, help="Generated patients, two runs each."
+    "--patients",
+    type=COUNT,
+    default=10,
+    show_default=True,
+    help="Generated patients, two runs each.",
 )
-@click.option("--seed", default=7_300, show_default=True, help="Population of patients.")
+@click.option("--seed", type=SEED, default=7_300, show_default=True, help="Population of patients.")
 def frame_pairs(patients: int, seed: int) -> None:
     """Choose frames of generated cine runs, and say how far off the heart's phase is.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gcar_export.cli.evaluate import words
+from gcar_export.cli.options import COUNT, OUT_FILE, OUT_FOLDER, SEED
 
 if TYPE_CHECKING:
     from gcar_export.studies.gate_rows import Row
@@ -20,7 +21,7 @@ _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _SHARED = (
     click.option("--data", type=_FOLDER, help="Folder with label volumes: look at these as well."),
     click.option("--cases", default="", help="Only these of them, comma-separated."),
-    click.option("--out", type=click.Path(path_type=Path), required=True,
+    click.option("--out", type=OUT_FOLDER, required=True,
                  help="Rows, tables, pictures; may hold those of an earlier run."),
 )  # fmt: skip
 
@@ -64,9 +65,15 @@ def _say(parts: Sequence[str], file: Path) -> None:
 
 
 @click.command("gate-table")
-@click.option("--trees", default=24, show_default=True, help="Generated trees per seed.")
-@click.option("--seed", default=50_001, show_default=True, help="Population to choose gates on.")
-@click.option("--check-seed", default=50_002, show_default=True, help="Population to check on.")
+@click.option(
+    "--trees", type=COUNT, default=24, show_default=True, help="Generated trees per seed."
+)
+@click.option(
+    "--seed", type=SEED, default=50_001, show_default=True, help="Population to choose gates on."
+)
+@click.option(
+    "--check-seed", type=SEED, default=50_002, show_default=True, help="Population to check on."
+)
 @_shared
 def gate_table(
     trees: int, seed: int, check_seed: int, data: Path | None, cases: str, out: Path
@@ -102,11 +109,17 @@ def gate_table(
 
 
 @click.command("ghost-fit")
-@click.option("--trees", default=24, show_default=True, help="Generated trees to fit to.")
-@click.option("--seed", default=60_001, show_default=True, help="Population to fit to.")
-@click.option("--check-trees", default=12, show_default=True, help="Other trees, to check on.")
-@click.option("--check-seed", default=60_002, show_default=True, help="Their population.")
-@click.option("--write", type=click.Path(dir_okay=False, path_type=Path),
+@click.option(
+    "--trees", type=COUNT, default=24, show_default=True, help="Generated trees to fit to."
+)
+@click.option("--seed", type=SEED, default=60_001, show_default=True, help="Population to fit to.")
+@click.option(
+    "--check-trees", type=COUNT, default=12, show_default=True, help="Other trees, to check on."
+)
+@click.option(
+    "--check-seed", type=SEED, default=60_002, show_default=True, help="Their population."
+)
+@click.option("--write", type=OUT_FILE,
               help="Write the model there (gcar_deploy/quality/ghosts.json).")  # fmt: skip
 @_shared
 def ghost_fit(
@@ -144,9 +157,15 @@ def ghost_fit(
 
 
 @click.command("status-table")
-@click.option("--trees", default=12, show_default=True, help="Generated trees per seed.")
-@click.option("--seed", default=50_001, show_default=True, help="Population of the rule.")
-@click.option("--check-seed", default=50_002, show_default=True, help="Population to check on.")
+@click.option(
+    "--trees", type=COUNT, default=12, show_default=True, help="Generated trees per seed."
+)
+@click.option(
+    "--seed", type=SEED, default=50_001, show_default=True, help="Population of the rule."
+)
+@click.option(
+    "--check-seed", type=SEED, default=50_002, show_default=True, help="Population to check on."
+)
 @_shared
 def status_table(
     trees: int, seed: int, check_seed: int, data: Path | None, cases: str, out: Path

@@ -14,6 +14,7 @@ from gcar_export.cli.evaluate import converge, evaluate, paper_page
 from gcar_export.cli.frames import frame_pairs
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
 from gcar_export.cli.models import export, export_segmenter, golden, verify
+from gcar_export.cli.options import COUNT, DURATION, OUT_FILE, OUT_FOLDER
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table, speed_table
 from gcar_export.cli.training import train, train_devices, train_segmenter
 from gcar_export.cli.wrong_scenes import wrong_scenes
@@ -42,10 +43,16 @@ class _Group(click.Group):
             sys.exit(1)
         except Exception as error:
             logging.getLogger("gcar_export").info("internal error", exc_info=True)
-            detail = (str(error).splitlines() or [""])[0][:200]
-            kind = type(error).__name__
-            click.echo(f"gcar-export: error: internal: {kind} {detail}; see -v", err=True)
+            click.echo(f"gcar-export: error: {_said(error)}", err=True)
             sys.exit(1)
+
+
+def _said(error: Exception) -> str:
+    """One line about an error that nobody raised on purpose."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    detail = (str(error).splitlines() or [""])[0][:200]
+    return f"internal: {type(error).__name__} {detail}; see -v"
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -61,7 +68,7 @@ def main(verbose: bool) -> None:
 @click.option(
     "--run-option", "extra", multiple=True, help="Passed on to 'gcar run', one word each."
 )
-@click.option("--limit", default=600.0, show_default=True, help="Seconds per case.")
+@click.option("--limit", type=DURATION, default=600.0, show_default=True, help="Seconds per case.")
 def score(case_dirs: tuple[Path, ...], extra: tuple[str, ...], limit: float) -> None:
     """Score ready cases (view*.png, geom.json, truth.nii.gz) through 'gcar run'.
 
@@ -78,14 +85,14 @@ def score(case_dirs: tuple[Path, ...], extra: tuple[str, ...], limit: float) -> 
 
 @main.command()
 @click.argument("label", type=_FILE)
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=OUT_FOLDER)
 @click.option(
     "--protocol",
     type=click.Choice(["paper", "clinical", "moved", "raw"]),
     default="paper",
     show_default=True,
 )
-@click.option("--views", default=2, show_default=True, help="2 .. 16")
+@click.option("--views", type=click.IntRange(2, 16), default=2, show_default=True)
 def simulate(label: Path, out: Path, protocol: str, views: int) -> None:
     """Make a ready case from a label volume: pictures, geom.json, truth.nii.gz.
 
@@ -102,7 +109,7 @@ def simulate(label: Path, out: Path, protocol: str, views: int) -> None:
 
 @main.command("pair-time")
 @click.argument("label", type=_FILE)
-@click.option("--repeats", default=7, show_default=True, help="Timings of each.")
+@click.option("--repeats", type=COUNT, default=7, show_default=True, help="Timings of each.")
 def pair_time(label: Path, repeats: int) -> None:
     """Time a warm reconstruction against one itk-rtk forward + back projection.
 
@@ -125,7 +132,9 @@ def pair_time(label: Path, repeats: int) -> None:
 @click.option(
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
 )
-@click.option("--count", default=30, show_default=True, help="Generated trees of each style.")
+@click.option(
+    "--count", type=COUNT, default=30, show_default=True, help="Generated trees of each style."
+)
 def tree_table(data: Path | None, count: int) -> None:
     """Compare generated trees with real ones, figure by figure.
 
@@ -145,14 +154,23 @@ def tree_table(data: Path | None, count: int) -> None:
 @click.option(
     "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
 )
-@click.option("--count", default=30, show_default=True, help="Cases, one stenosis each.")
+@click.option(
+    "--count", type=COUNT, default=30, show_default=True, help="Cases, one stenosis each."
+)
 @click.option(
     "--vessels",
+    type=click.IntRange(0),
     default=0,
     show_default=True,
     help="Single vessels of known area, of each kind of picture.",
 )
-@click.option("--healthy", default=0, show_default=True, help="Generated trees without a lesion.")
+@click.option(
+    "--healthy",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Generated trees without a lesion.",
+)
 def lumen_table(data: Path | None, count: int, vessels: int, healthy: int) -> None:
     """Measure stenosis, radius and branch lengths on trees with one known stenosis.
 
@@ -217,7 +235,7 @@ for _verb in (
 
 @main.command()
 @click.option("--data", type=_FOLDER, required=True, help="Folder with phantom_xa/.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="New folder.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="New folder.")
 @click.option("--landmarks", type=_FILE, help="JSON of landmarks marked in the four views.")
 def phantom(data: Path, out: Path, landmarks: Path | None) -> None:
     """Fit some real X-ray runs of a phantom, predict the others; tables and a page.
@@ -238,8 +256,8 @@ def phantom(data: Path, out: Path, landmarks: Path | None) -> None:
 
 
 @main.command("pose-table")
-@click.option("--trees", default=3, show_default=True, help="Generated trees.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows (JSON lines).")
+@click.option("--trees", type=COUNT, default=3, show_default=True, help="Generated trees.")
+@click.option("--out", type=OUT_FILE, required=True, help="Rows (JSON lines).")
 def pose_table(trees: int, out: Path) -> None:
     """Measure trees from a second view that is off, with and without pose refinement.
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from gcar_deploy.errors import UsageError
+from gcar_export.cli.options import COUNT, OUT_FILE
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _REPLACE = click.option("--force", is_flag=True, help="Replace a model that is there.")
@@ -19,10 +20,8 @@ def _check_free(out: Path, force: bool) -> None:
 
 @click.command()
 @click.argument("checkpoint", type=_FILE)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
-@click.option(
-    "--inputs", type=click.IntRange(1), default=60, show_default=True, help="For the parity check."
-)
+@click.option("--out", type=OUT_FILE, required=True, help="The ONNX file.")
+@click.option("--inputs", type=COUNT, default=60, show_default=True, help="For the parity check.")
 @click.option("--int8", is_flag=True, help="Also try OUT-int8.onnx, kept if the task allows it.")
 @_REPLACE
 def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) -> None:
@@ -47,7 +46,9 @@ def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) ->
 
 @click.command()
 @click.argument("model", type=_FILE)
-@click.option("--scenes", default=12, show_default=True, help="Generated scenes to run.")
+@click.option(
+    "--scenes", type=COUNT, default=12, show_default=True, help="Generated scenes to run."
+)
 def verify(model: Path, scenes: int) -> None:
     """Check a model file against its spec and run it through the runtime's own predictor.
 
@@ -76,7 +77,7 @@ def golden(model: Path, force: bool) -> None:
 
 @click.command("export-segmenter")
 @click.argument("checkpoint", type=_FILE)
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="The ONNX file.")
+@click.option("--out", type=OUT_FILE, required=True, help="The ONNX file.")
 @click.option("--devices", type=_FILE, help="Of train-devices, or a model that has one: goes in.")
 @_REPLACE
 def export_segmenter(checkpoint: Path, out: Path, devices: Path | None, force: bool) -> None:

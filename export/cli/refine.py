@@ -10,6 +10,7 @@ import click
 
 from gcar_deploy.errors import UsageError
 from gcar_export.cli.evaluate import words
+from gcar_export.cli.options import COUNT, OUT_FILE, OUT_FOLDER, SEED, Number
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -22,7 +23,7 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 @click.option("--noises", default="0,0.5,1,2", show_default=True, help="Start noise, voxels.")
 @click.option(
     "--out",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=OUT_FOLDER,
     default=None,
     help="Folder that keeps every fit; a run with the same folder goes on where it stopped.",
 )
@@ -70,7 +71,7 @@ def cost_curves() -> None:
 @click.option("--protocol", default="paper", show_default=True, help="paper, clinical or raw.")
 @click.option("--rounds", type=click.IntRange(1, 100), default=3, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON in place of the table.")
-@click.option("--picture", type=click.Path(path_type=Path), help="New PNG: pairs against DSC.")
+@click.option("--picture", type=OUT_FILE, help="New PNG: pairs against DSC.")
 def speed_table(
     labels: tuple[Path, ...], protocol: str, rounds: int, as_json: bool, picture: Path | None
 ) -> None:
@@ -100,8 +101,10 @@ def speed_table(
 
 
 @click.command("sigma-table")
-@click.option("--seed", default=1, show_default=True, help="Population of generated trees.")
-@click.option("--trees", default=10, show_default=True, help="Trees per row.")
+@click.option(
+    "--seed", type=SEED, default=1, show_default=True, help="Population of generated trees."
+)
+@click.option("--trees", type=COUNT, default=10, show_default=True, help="Trees per row.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
 @click.option("--pictures", default="clean,degraded,mask,raw", show_default=True)
 @click.option("--predictors", default="multi,none", show_default=True)
@@ -139,8 +142,11 @@ def sigma_table(
 
 
 @click.command("flow-table")
-@click.option("--count", default=20, show_default=True, help="Generated trees.")
-@click.option("--percent", default=60.0, show_default=True, help="Diameter stenosis of each.")
+@click.option("--count", type=COUNT, default=20, show_default=True, help="Generated trees.")
+@click.option(
+    "--percent", type=Number(1, 99), default=60.0, show_default=True,
+    help="Diameter stenosis of each.",
+)  # fmt: skip
 @click.option("--fit", is_flag=True, help="Other trees, of 30 .. 75 %, and constants.")
 def flow_table(count: int, percent: float, fit: bool) -> None:
     """Compare the pressure drop behind a stenosis with that of the true lumen.

@@ -7,14 +7,25 @@ from pathlib import Path
 import click
 
 from gcar_export.cli.evaluate import words
+from gcar_export.cli.options import COUNT, OUT_FOLDER, SEED
 
 
 @click.command("wrong-scenes")
-@click.option("--trees", default=6, show_default=True, help="Examinations that are spoilt.")
-@click.option("--right", default=4, show_default=True, help="More right ones of each kind.")
-@click.option("--seed", default=62_002, show_default=True, help="Population of generated trees.")
+@click.option(
+    "--trees", type=COUNT, default=6, show_default=True, help="Examinations that are spoilt."
+)
+@click.option(
+    "--right",
+    type=click.IntRange(0),
+    default=4,
+    show_default=True,
+    help="More right ones of each kind.",
+)
+@click.option(
+    "--seed", type=SEED, default=62_002, show_default=True, help="Population of generated trees."
+)
 @click.option("--families", default="", help="Only these, comma-separated.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Rows (CSV), table.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Rows (CSV), table.")
 def wrong_scenes(trees: int, right: int, seed: int, families: str, out: Path) -> None:
     """Reconstruct scenes that are wrong on purpose: which are called ok, and how far off they are.
 

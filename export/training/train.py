@@ -60,7 +60,7 @@ def start(
         "steps": steps, "decay_steps": decay_steps, "learning_rate": learning_rate, "seed": seed,
     }  # fmt: skip
     changes: dict[str, Any] = {k: v for k, v in asked.items() if v}
-    until = minutes * 60 if minutes else None
+    until = None if minutes is None else minutes * 60
     if network == "multi":
         options = dataclasses.replace(train_multi.PRESETS[preset], **changes)
         _check_device(options.device)

@@ -1,0 +1,66 @@
+"""What the workshop's commands refuse before they work: numbers, places to write to."""
+
+import re
+
+import pytest
+from click.testing import CliRunner
+
+from gcar_export.cli.main import main
+
+
+def said(*words):
+    done = CliRunner().invoke(main, [str(word) for word in words])
+    return done.exit_code, done.output
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["train --minutes 0", "train --minutes nan", "train --minutes inf", "train --learning-rate nan",
+     "train-segmenter --steps 0", "train-segmenter --minutes -3", "train-segmenter --batch 0",
+     "train-segmenter --pictures 0", "train-segmenter --learning-rate 0",
+     "train-segmenter --real-share 2", "train-devices --minutes 0", "train-devices --seed -1",
+     "verify M --scenes 0", "verify M --scenes -1", "gate-table --trees 0", "sigma-table --trees 0",
+     "pair-time M --repeats 0", "score D --limit nan", "simulate M OUT --views 17",
+     "evaluate --jobs 0", "flow-table --count 0", "pose-table --trees 0", "tree-table --count 0",
+     "lumen-table --vessels -1", "wrong-scenes --trees 0", "frame-pairs --patients 0"],
+)  # fmt: skip
+def test_numbers_out_of_range_are_refused(tmp_path, words):
+    (tmp_path / "M").touch()
+    places = {"M": tmp_path / "M", "D": tmp_path, "OUT": tmp_path / "out"}
+    *rest, option, value = (places.get(word, word) for word in words.split())
+    code, output = said(*rest, option, value)
+    assert code == 2
+    assert re.search(rf"Invalid value for '{option}': {value}(\.0)? is not", output), output
+
+
+@pytest.mark.parametrize(
+    "words", ["train --out", "train-segmenter --out", "evaluate --out", "simulate MODEL"]
+)
+def test_a_folder_to_write_that_is_a_file_or_below_one_is_one_line(tmp_path, words):
+    file = tmp_path / "file"
+    file.write_text("x")
+    given = [file if word == "MODEL" else word for word in words.split()]
+    for path in (file, file / "below" / "it"):
+        code, output = said(*given, path)
+        name = "OUT" if given[0] == "simulate" else "--out"
+        assert (code, output) == (
+            2, f"gcar-export: error: {name} {path}: {file} is a file, not a folder\n"
+        )  # fmt: skip
+    assert file.read_text() == "x"
+
+
+def test_a_model_to_write_that_is_a_folder_is_one_line(tmp_path):
+    (tmp_path / "c.safetensors").touch()
+    code, output = said("export", tmp_path / "c.safetensors", "--out", tmp_path)
+    assert (code, output) == (
+        2, f"gcar-export: error: --out {tmp_path} is a folder: name a file\n"
+    )  # fmt: skip
+
+
+def test_what_the_system_refuses_is_one_line_with_its_file(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device", "runs/a/log.csv")
+
+    monkeypatch.setattr("gcar_export.training.train.start", full)
+    code, output = said("train", "--out", tmp_path / "a")
+    assert (code, output) == (1, "gcar-export: error: runs/a/log.csv: No space left on device\n")
