@@ -13,9 +13,16 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _REPLACE = click.option("--force", is_flag=True, help="Replace a model that is there.")
 
 
-def _check_free(out: Path, force: bool) -> None:
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists; add --force to replace it")
+def _check_free(out: Path, force: bool, int8: bool = False) -> None:
+    """Refuse to write over a model, its spec or its golden case unasked."""
+    from gcar_deploy.models import golden_path
+
+    if out.suffix != ".onnx":
+        raise UsageError(f"--out {out}: the file to write must end in .onnx")
+    for model in (out, out.with_name(f"{out.stem}-int8.onnx"))[: 1 + int8]:
+        for path in (model, model.with_suffix(".json"), golden_path(model)):
+            if path.exists() and not force:
+                raise UsageError(f"{path} exists; add --force to replace it")
 
 
 @click.command()
@@ -31,7 +38,7 @@ def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) ->
     """
     from gcar_export.shipping.parity import export_checked
 
-    _check_free(out, force)
+    _check_free(out, force, int8)
     found = export_checked(checkpoint, out, inputs)
     click.echo(
         f"{out}: {found.inputs} inputs, largest difference {found.worst:.1e} of the range, "

@@ -27,7 +27,7 @@ from gcar_deploy.imaging.net import (
     open_segmenter,
 )
 from gcar_deploy.imaging.skeleton import skeletonize
-from gcar_deploy.models import Session
+from gcar_deploy.models import Session, golden_path
 from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
@@ -182,6 +182,8 @@ def export_segmenter(
         dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols}, {0: count}, {0: count}),
     )
     out.parent.mkdir(parents=True, exist_ok=True)
+    # That of a model which is replaced would be refused with the new one.
+    golden_path(out).unlink(missing_ok=True)
     program.save(str(out), external_data=False)
     model = onnx.load(str(out))
     model.ir_version = IR_VERSION

@@ -144,6 +144,7 @@ def export_checked(checkpoint: Path, out: Path, inputs: int = 60, task_scenes: i
     if out.suffix != ".onnx":
         raise ModelError(f"{out.name}: the file to write must end in .onnx")
     partial = out.with_name(f"{out.stem}.partial.onnx")
+    new = not out.parent.exists()
     try:
         export_model(checkpoint, partial)
         found = parity(checkpoint, partial, inputs)
@@ -161,6 +162,8 @@ def export_checked(checkpoint: Path, out: Path, inputs: int = 60, task_scenes: i
     finally:
         for path in (partial, partial.with_suffix(".json")):
             path.unlink(missing_ok=True)
+        if new and out.parent.is_dir() and not any(out.parent.iterdir()):
+            out.parent.rmdir()
     return found
 
 

@@ -57,6 +57,22 @@ def test_a_model_to_write_that_is_a_folder_is_one_line(tmp_path):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("verb", ["export", "export-segmenter"])
+@pytest.mark.parametrize("name", ["m.onnx", "m.json", "m.golden.npz"])
+def test_no_file_of_a_model_is_replaced_unasked(tmp_path, verb, name):
+    (tmp_path / "c.safetensors").touch()
+    (tmp_path / name).write_text("mine")
+    given = [verb, tmp_path / "c.safetensors", "--out", tmp_path / "m.onnx"]
+    line = f"gcar-export: error: {tmp_path / name} exists; add --force to replace it\n"
+    assert said(*given) == (2, line)
+    if verb == "export":
+        (tmp_path / name).rename(tmp_path / name.replace("m.", "m-int8."))
+        line = line.replace("/m.", "/m-int8.")
+        assert said(*given, "--int8") == (2, line)
+    code, output = said(*given[:-1], tmp_path / "m.json")
+    assert code == 2 and output.endswith("m.json: the file to write must end in .onnx\n")
+
+
 def test_what_the_system_refuses_is_one_line_with_its_file(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device", "runs/a/log.csv")
