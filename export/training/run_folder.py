@@ -28,7 +28,9 @@ from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, weights
 
 SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from
-FIXED = ("network", "config", "seed", "labels", "warm_start")
+FIXED = ("network", "config", "seed", "labels", "warm_start", "scenes", "segmenter")
+#: options that may change on the way: how long, how often saved, by what it is worked on
+FREE = ("steps", "decay_steps", "warmup_steps", "save_every", "workers", "device", "compiled")
 
 
 class RunFolder:
@@ -43,7 +45,8 @@ class RunFolder:
     Raises
     ------
     UsageError
-        The folder holds a run of another network, size, seed, set of labels or first weights.
+        The folder holds a run of another network, size, seed, set of labels, first weights or
+        other options than those of ``FREE``, or a checkpoint without its manifest.
     """
 
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
@@ -60,17 +63,26 @@ class RunFolder:
     def _check_same(self) -> None:
         file = self.path / "manifest.json"
         if not file.is_file():
+            if self.checkpoint.exists():
+                raise UsageError(
+                    f"{self.checkpoint} has no manifest.json beside it, which says what it was "
+                    "trained on; give another --out"
+                )
             return
         try:
             before = json.loads(file.read_text(encoding="utf-8"))
         except ValueError:
             raise UsageError(f"{file} is not JSON; give another --out") from None
         now = json.loads(json.dumps(self.manifest))
-        for key in FIXED:
-            if before.get(key) != now.get(key):
+        pairs = {key: (before.get(key), now.get(key)) for key in FIXED}
+        old, new = before.get("options") or {}, now.get("options") or {}
+        # A run of an earlier version may lack an option that there is by now.
+        pairs |= {key: (old[key], new[key]) for key in new if key in old and key not in FREE}
+        for key, (was, wanted) in pairs.items():
+            if was != wanted:
                 raise UsageError(
-                    f"{self.path} holds a run with {_shown(key, before.get(key))}, this one has "
-                    f"{_shown(key, now.get(key))}; give another --out, or the same {key}"
+                    f"{self.path} holds a run with {_shown(key, was)}, this one has "
+                    f"{_shown(key, wanted)}; give another --out, or the same {key}"
                 )
         if "best" in before:
             self.manifest["best"] = before["best"]
@@ -129,6 +141,9 @@ class RunFolder:
             "numpy": np.__version__,
             "python": platform.python_version(),
         }
+        # A checkpoint is never without a manifest, not even if this is cut off here.
+        if not (self.path / "manifest.json").is_file():
+            self._write_manifest()
         os.replace(partial, self.checkpoint)
         self._write_manifest()
 

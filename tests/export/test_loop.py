@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 
 from safetensors.torch import load_file  # noqa: E402
 
+from gcar_deploy.errors import UsageError  # noqa: E402
 from gcar_export.training.loop import (  # noqa: E402
     Lesson,
     learn,
@@ -79,6 +81,44 @@ def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
     assert one.keys() == two.keys()
     for name, value in one.items():
         np.testing.assert_array_equal(value, two[name], err_msg=name)
+
+
+@pytest.mark.parametrize("key", ["learning_rate", "batch", "scenes", "segmenter"])
+def test_a_run_does_not_go_on_with_other_options(tmp_path, key):
+    def manifest(**changed):
+        given = {"options": dataclasses.asdict(options()), "scenes": {"noise": 1}, "segmenter": "a"}
+        for name, value in changed.items():
+            place = given["options"] if name in given["options"] else given
+            place[name] = value
+        return MANIFEST | given
+
+    net = line()
+    learn(RunFolder(tmp_path, manifest()), net, options(steps=1), lesson(net, steps=1))
+    RunFolder(tmp_path, manifest(steps=90, decay_steps=3, save_every=1))
+    with pytest.raises(UsageError, match=rf"with {key} = .*, this one has {key} = .*same {key}"):
+        RunFolder(tmp_path, manifest(**{key: 0.5}))
+    older = json.loads((tmp_path / "manifest.json").read_text())
+    del older["options"]["batch"]
+    (tmp_path / "manifest.json").write_text(json.dumps(older))
+    RunFolder(tmp_path, manifest())
+    (tmp_path / "manifest.json").unlink()
+    with pytest.raises(UsageError, match=r"\.safetensors has no manifest\.json beside it"):
+        RunFolder(tmp_path, manifest())
+
+
+def test_a_first_checkpoint_is_never_without_its_manifest(tmp_path, monkeypatch):
+    def cut_off(*_):
+        assert json.loads((tmp_path / "manifest.json").read_text())["step"] == 1
+        raise KeyboardInterrupt
+
+    net = line()
+    folder = RunFolder(tmp_path, MANIFEST)
+    replace = os.replace
+    monkeypatch.setattr(
+        "os.replace", lambda a, b: cut_off() if b == folder.checkpoint else replace(a, b)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        learn(folder, net, options(steps=1), lesson(net, steps=1))
 
 
 @pytest.mark.slow
