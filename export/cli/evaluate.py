@@ -149,6 +149,12 @@ def evaluate(
     click.echo(evaluation_tables.markdown(rows, reference))
     click.echo(peers.beside_peers(rows))
     click.echo(draw(rows, out, reference))
+    lost = evaluation.without_case(rows)
+    if lost:
+        count = len({row["case"] for row in rows})
+        click.echo(f"{len(lost)} of {count} cases could not be made:", err=True)
+    for reason in lost.values():
+        click.echo(f"  {reason}", err=True)
 
 
 @click.command()

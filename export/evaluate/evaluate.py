@@ -1,7 +1,8 @@
 """Evaluate methods over label volumes: simulate, reconstruct, measure, tabulate, draw.
 
 One job is one case, one number of views and one method; its row is written as soon as it
-is done, so an interrupted evaluation goes on where it stopped. Every row remembers the
+is done, so an interrupted evaluation goes on where it stopped. A label that no case can be made of
+has rows with the reason. Every row remembers the
 settings and the label file it was made with: rows of others are made anew, or refused, and never
 mixed in unsaid.
 """
@@ -20,7 +21,7 @@ from typing import Any
 from gcar_deploy.errors import UsageError
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
-from gcar_export.evaluate.jobs import Job, case_name, row_path, write_done
+from gcar_export.evaluate.jobs import NO_CASE, Job, case_name, row_path, write_done
 from gcar_export.methods.settings import METHODS, MethodSettings
 from gcar_export.methods.solve import check_models
 from gcar_export.scenes.labels import case_stem
@@ -146,8 +147,8 @@ def evaluate(
     Raises
     ------
     UsageError
-        No label volume; rows of other settings or label files and ``changed`` is ``refuse``; no
-        cluster.
+        No label volume, or none that a case can be made of; rows of other settings or label files
+        and ``changed`` is ``refuse``; no cluster.
     ModelError
         A method's model is missing.
     """
@@ -171,22 +172,38 @@ def evaluate(
         for method in options.methods
     ]  # fmt: skip
     missing = _missing(jobs, options)
-    for folder in ("rows", "sides"):
-        (options.out / folder).mkdir(parents=True, exist_ok=True)
-    _write_settings(options)
     done = len(jobs) - len(missing)
+    works = done > 0
+    if works:
+        _make_folders(options)
     if on_progress is not None and done:
         on_progress(done, len(jobs), f"{done} rows kept")
+    held: list[Outcome] = []
     # Closed at once, also by an interrupt: workers must not outlive the loop.
     with contextlib.closing(_outcomes(missing, options)) as outcomes:
         for job, outcome in outcomes:
-            write_done(options.out, job, outcome)
+            # Nothing is left behind where no case works.
+            held.append((job, outcome))
+            if not works and outcome.row["status"] != NO_CASE:
+                works = True
+                _make_folders(options)
+            while works and held:
+                write_done(options.out, *held.pop(0))
             done += 1
             if on_progress is not None:
                 on_progress(done, len(jobs), job.name)
-    rows = [_read(row_path(options.out, job)) for job in jobs]
+    rows = [o.row for _, o in held] or [_read(row_path(options.out, job)) for job in jobs]
+    lost = without_case(rows)
+    if len(lost) == len(labels):
+        raise UsageError(f"no case can be made: {next(iter(lost.values()))}")
     write_tables(rows, options.out, options.reference or options.methods[0])
     return rows
+
+
+def without_case(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the cases that could not be made in any of their rows, each with the reason."""
+    made = {row["case"] for row in rows if row["status"] != NO_CASE}
+    return {row["case"]: row["sentence"] for row in rows if row["case"] not in made}
 
 
 def write_tables(rows: Sequence[dict[str, Any]], out: Path, reference: str) -> None:
@@ -248,8 +265,10 @@ def _outcomes(jobs: Sequence[Job], options: EvaluateOptions) -> Generator[Outcom
         yield from run_in_processes(jobs, options.settings, options.jobs)
 
 
-def _write_settings(options: EvaluateOptions) -> None:
-    """Add the settings of these methods to ``settings.json``, for whoever reads the folder."""
+def _make_folders(options: EvaluateOptions) -> None:
+    """Make the folders; ``settings.json`` tells readers the settings of these methods as well."""
+    for folder in ("rows", "sides"):
+        (options.out / folder).mkdir(parents=True, exist_ok=True)
     path = options.out / "settings.json"
     known = json.loads(path.read_text()) if path.exists() else {}
     for method in options.methods:

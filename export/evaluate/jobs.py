@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from gcar_deploy.errors import UsageError
 from gcar_deploy.measure.metrics import (
     VOLUME_MEASURES,
     Measure,
@@ -34,6 +35,8 @@ from gcar_export.scenes.thin_protocol import THIN, line_measures, thin_case
 
 #: name that the truth's own pictures are kept under, beside the methods.
 TRUTH = "truth"
+#: status of a row without measures: its label is empty, or lacks a tree that the protocol shows
+NO_CASE = "no case"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,12 +76,13 @@ class Done:
     Attributes
     ----------
     row : plain values, as ``rows/*.json`` holds them
-    sides, truth_sides : (rows, columns) uint8 from ``three_sides``; None without a volume
+    sides, truth_sides : (rows, columns) uint8 from ``three_sides``; None without a volume, and of
+        the truth where no case could be made of the label
     """
 
     row: dict[str, Any]
     sides: Array | None
-    truth_sides: Array
+    truth_sides: Array | None
 
 
 def case_name(label: Path) -> str:
@@ -88,8 +92,11 @@ def case_name(label: Path) -> str:
 
 
 def run_job(job: Job, settings: MethodSettings) -> Done:
-    """Make one row."""
-    case = _case(job.label, job.data, job.protocol, job.views)
+    """Make one row; of a label that no case can be made of one with the reason."""
+    try:
+        case = _case(job.label, job.data, job.protocol, job.views)
+    except UsageError as error:
+        return _without_case(job, str(error))
     solved = solve(case, job.method, settings)
     found = measure(case, solved)
     row = {
@@ -115,6 +122,27 @@ def run_job(job: Job, settings: MethodSettings) -> Done:
         sides=three_sides(solved.volume) if finite and solved.volume is not None else None,
         truth_sides=three_sides(case.truth),
     )
+
+
+def _without_case(job: Job, reason: str) -> Done:
+    row = {
+        "protocol": job.protocol,
+        "dataset": dataset(job.label),
+        "case": job.case,
+        "method": job.method,
+        "views": job.views,
+        "status": NO_CASE,
+        "sentence": reason,
+        "measures": {},
+        "reasons": {},
+        "gaussians": None,
+        "seconds": None,
+        "cpu_seconds": None,
+        "stages": {},
+        "settings": job.digest,
+        "label_sha256": job.data,
+    }
+    return Done(row=row, sides=None, truth_sides=None)
 
 
 def dataset(label: Path) -> str:

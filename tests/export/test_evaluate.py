@@ -293,6 +293,47 @@ def test_rows_are_tied_to_their_label_file(data, tmp_path, monkeypatch, caplog, 
     evaluate.evaluate(evaluate.EvaluateOptions(**given, changed="refuse"))
 
 
+def test_a_label_that_no_case_can_be_made_of_is_a_row_with_its_reason(data, tmp_path):
+    from click.testing import CliRunner
+
+    from gcar_export.cli.main import main
+
+    labels = tmp_path / "data"
+    labels.mkdir()
+    good = nibabel.load(data / "imagecas" / "1.label.nii.gz")
+    one = np.asarray(good.dataobj).copy()
+    one[:60] = 0
+    for name, array in (("0-empty", 0 * one), ("1-single", one)):
+        nibabel.save(nibabel.Nifti1Image(array, good.affine), labels / f"{name}.nii.gz")
+    given = ["evaluate", "--data", labels, "--protocol", "clinical", "--methods", "visual_hull"]
+    given += ["--quiet", "--out", tmp_path / "out"]
+
+    def command(*more):
+        done = CliRunner().invoke(main, [str(word) for word in (*given, *more)])
+        return done.exit_code, done.stderr.splitlines()
+
+    code, (line,) = command()
+    assert code == 2 and not (tmp_path / "out").exists()
+    assert line.startswith("gcar-export: error: no case can be made: ")
+    assert line.endswith("0-empty.nii.gz: the label volume is empty")
+    nibabel.save(good, labels / "2.nii.gz")
+    code, lines = command()
+    assert code == 0 and lines[0] == "2 of 3 cases could not be made:"
+    assert lines[1].endswith("0-empty.nii.gz: the label volume is empty")
+    assert lines[2] == "  1-single: one connected part only, no left and right tree"
+    rows = evaluation_tables.read_case_rows(tmp_path / "out" / "cases.csv")
+    assert [(row["case"], row["status"]) for row in rows] == [
+        ("0-empty", "no case"), ("1-single", "no case"), ("2", "ok"),
+    ]  # fmt: skip
+    assert rows[1]["sentence"] == lines[2].strip() and rows[1]["seconds"] is None
+    assert "(n=1)" in (tmp_path / "out" / "tables.md").read_text()
+    assert (tmp_path / "out" / "report.html").is_file()
+    # kept like any other row; alone it is an error again
+    assert command("--changed", "refuse") == (code, lines)
+    code, (line,) = command("--cases", "1-single")
+    assert code == 2 and line.endswith("no left and right tree")
+
+
 def test_rows_depend_on_their_own_settings_alone():
     plain, other = MethodSettings(), MethodSettings(paper_steps=7)
     same = {m for m in METHODS if plain.digest(m) == other.digest(m)}
