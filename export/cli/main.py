@@ -76,11 +76,18 @@ def score(case_dirs: tuple[Path, ...], extra: tuple[str, ...], limit: float) -> 
     """
     from gcar_export.evaluate import score as scoring
 
-    scores = []
-    for folder in case_dirs:
-        scores.append(scoring.score_case(folder, extra, limit))
-        click.echo(f"[{len(scores)}/{len(case_dirs)}] {folder.name}", err=True)
-    click.echo(scoring.table(scores))
+    scores, wrong = [], []
+    for k, folder in enumerate(case_dirs):
+        try:
+            scores.append(scoring.score_case(folder, extra, limit))
+        except UsageError as error:
+            wrong.append(str(error))
+        click.echo(f"[{k + 1}/{len(case_dirs)}] {folder.name}", err=True)
+    if scores:
+        click.echo(scoring.table(scores))
+    if wrong:
+        count = f"{len(wrong)} of {len(case_dirs)} cases were not scored"
+        raise UsageError(f"{count}: {'; '.join(wrong)}")
 
 
 @main.command()

@@ -1,7 +1,8 @@
 """Score ready cases through the command line: ``gcar run`` as a user would call it.
 
-A ready case is a folder with ``view1.png`` ..., ``geom.json`` and ``truth.nii.gz``. The
-command runs in a process of its own; only its exit code and ``volume.nii.gz`` are looked at.
+A ready case is a folder with ``view1.png`` ..., ``geom.json`` and ``truth.nii.gz``: the share of
+each voxel that is vessel, 0 .. 1. The command runs in a process of its own; only its exit code and
+``volume.nii.gz`` are looked at.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import nibabel
 import numpy as np
+from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.measure.metrics import Measure, best_dice, best_shifted_dice, volume_dice
@@ -60,11 +64,12 @@ def score_case(folder: Path, extra: Sequence[str] = (), limit_s: float = 600.0) 
     Raises
     ------
     UsageError
-        If the folder is not a ready case.
+        If the folder is not a ready case, or its truth holds other values than 0 .. 1.
     """
     pictures = sorted(folder.glob("view*.png"), key=_number)
     if not pictures or not (folder / "truth.nii.gz").is_file():
         raise UsageError(f"{folder}: not a ready case (view*.png, geom.json, truth.nii.gz)")
+    truth, affine = _truth(folder / "truth.nii.gz")
     with tempfile.TemporaryDirectory(prefix="gcar-score-") as scratch:
         out = Path(scratch) / "result"
         command = [sys.executable, "-m", "gcar_deploy.cli.main", "run"]
@@ -82,7 +87,7 @@ def score_case(folder: Path, extra: Sequence[str] = (), limit_s: float = 600.0) 
                 best_dsc=none,
             )  # fmt: skip
         seconds = time.perf_counter() - start
-        truth, predicted, status = _read(folder, out)
+        predicted, status = _read(folder, out, truth, affine)
     if folder.name.startswith(MOVED_PREFIX):
         dsc = best_shifted_dice(truth, predicted)
     else:
@@ -118,18 +123,32 @@ def table(scores: Sequence[Score]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _read(folder: Path, out: Path) -> tuple[Array, Array | None, str]:
-    image: Any = nibabel.load(folder / "truth.nii.gz")
-    truth = np.asarray(image.dataobj)
+def _truth(path: Path) -> tuple[Array, Array]:
+    """Return occupancy, 0 .. 1, and the (4, 4) affine, mm RAS."""
+    try:
+        image: Any = nibabel.load(path)
+        truth = np.asarray(image.dataobj)
+    except (ImageFileError, HeaderDataError, OSError, EOFError, ValueError, zlib.error) as error:
+        reason = (str(error).splitlines() or [""])[0][:200]
+        raise UsageError(f"{path}: cannot be read ({reason})") from None
+    # Not "outside": a comparison with NaN is false.
+    if not (truth.min() >= 0 and truth.max() <= 1):
+        raise UsageError(
+            f"{path}: values {truth.min():g} .. {truth.max():g} are not 0 .. 1 (share of vessel)"
+        )
+    return truth, image.affine
+
+
+def _read(folder: Path, out: Path, truth: Array, affine: Array) -> tuple[Array | None, str]:
     if not (out / "volume.nii.gz").is_file():
-        return truth, None, ""
+        return None, ""
     found: Any = nibabel.load(out / "volume.nii.gz")
     predicted = np.asarray(found.dataobj)
     same = predicted.shape == truth.shape
-    if not same or np.abs(found.affine - image.affine).max() > AFFINE_TOLERANCE_MM:
+    if not same or np.abs(found.affine - affine).max() > AFFINE_TOLERANCE_MM:
         raise UsageError(f"{folder.name}: the volume is not on the truth's grid")
     status = json.loads((out / "result.json").read_text()).get("status", "")
-    return truth, predicted, status
+    return predicted, status
 
 
 def _percent(measure: Measure) -> str:

@@ -514,6 +514,33 @@ def test_score_refuses_a_folder_that_is_no_case(tmp_path):
         score.score_case(tmp_path)
 
 
+def _ready(folder, truth):
+    folder.mkdir()
+    (folder / "view1.png").touch()
+    nibabel.save(nibabel.Nifti1Image(truth, np.eye(4)), folder / "truth.nii.gz")
+    return folder
+
+
+def test_score_goes_on_after_a_case_that_is_none(tmp_path, monkeypatch):
+    from click.testing import CliRunner
+
+    from gcar_export.cli.main import main
+
+    none = types.SimpleNamespace(returncode=6, stderr="gcar: no vessel")
+    monkeypatch.setattr(score.subprocess, "run", lambda *_, **__: none)
+    cube = np.zeros((3, 3, 3), np.float32)
+    cube[1, 1, 1] = 1
+    cases = [_ready(tmp_path / "shares", 255 * cube), _ready(tmp_path / "nan", cube * np.nan),
+             _ready(tmp_path / "good", cube), tmp_path / "empty"]  # fmt: skip
+    cases[-1].mkdir()
+    done = CliRunner().invoke(main, ["score", *map(str, cases)])
+    assert done.exit_code == 2 and "| good | 6 | gcar: no vessel |" in done.stdout
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("gcar-export: error: 3 of 4 cases were not scored: ")
+    assert "shares/truth.nii.gz: values 0 .. 255 are not 0 .. 1 (share of vessel)" in last
+    assert "nan/truth.nii.gz: values nan" in last and "empty: not a ready case" in last
+
+
 def test_score_reads_what_the_command_wrote(data, tmp_path, monkeypatch):
     case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "clinical")
     folder = tmp_path / "M_1"
