@@ -24,7 +24,8 @@ import torch
 import torch.distributed
 import torch.multiprocessing
 
-from gcar_deploy.errors import ModelError
+from gcar_deploy import errors
+from gcar_deploy.errors import GcarError, ModelError
 from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training.dataset import TrainingScene, training_scene
 from gcar_export.training.examinations import SceneOptions
@@ -213,7 +214,17 @@ def train(
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         job = dataclasses.replace(job, port=probe.getsockname()[1])
-    torch.multiprocessing.spawn(_replica, args=(job,), nprocs=options.replicas, join=True)
+    try:
+        torch.multiprocessing.spawn(_replica, args=(job,), nprocs=options.replicas, join=True)
+    except torch.multiprocessing.ProcessRaisedException as error:
+        raise _reason_of(error) from error
+
+
+def _reason_of(error: Exception) -> GcarError:
+    """Return what a replica said in the last line of its traceback, as the error that it was."""
+    kind, _, text = str(error).strip().splitlines()[-1].partition(": ")
+    own = getattr(errors, kind.removeprefix(f"{errors.__name__}."), None)
+    return own(text) if own else GcarError(f"a replica ended: {kind} {text}".rstrip())
 
 
 def _end_with_parent() -> None:

@@ -21,10 +21,10 @@ from typing import Any
 import click
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
-from gcar_deploy.errors import UsageError
-from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, weights
+from gcar_deploy.errors import ModelError, UsageError
+from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
 
 SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from
@@ -96,13 +96,22 @@ class RunFolder:
         """Load weights and optimiser state if there are any; return the step reached.
 
         ``mean`` takes the mean of the weights, or the weights where none was kept.
+
+        Raises
+        ------
+        ModelError
+            The checkpoint is damaged, or does not fit its manifest.
         """
         if not self.checkpoint.is_file():
             return 0
-        data = load_file(self.checkpoint)
-        load_weights(net, data)
-        if mean is not None:
-            mean.load_state_dict(best_weights(data))
+        data = read_tensors(self.checkpoint)
+        try:
+            load_weights(net, data)
+            if mean is not None:
+                mean.load_state_dict(best_weights(data))
+            step = int(data["step"])
+        except (RuntimeError, KeyError):
+            raise ModelError(f"{self.checkpoint} does not fit its manifest.json") from None
         state: dict[int, dict[str, torch.Tensor]] = {}
         for n, (name, _) in enumerate(net.named_parameters()):
             prefix = f"opt.{name}."
@@ -111,7 +120,7 @@ class RunFolder:
                 state[n] = own
         groups = optimiser.state_dict()["param_groups"]
         optimiser.load_state_dict({"state": state, "param_groups": groups})
-        return int(data["step"])
+        return step
 
     def save(
         self,
@@ -181,6 +190,18 @@ class RunFolder:
                 writer.writerow({"step": step, "loss": f"{loss:.4f}", "kind": kind, **shown})
         os.replace(partial, file)
         draw_curve(read_log(file), self.path / "curve.png")
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises
+    ------
+    UsageError
+        ``cuda`` where torch finds none.
+    """
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError("preset gpu needs a CUDA device, and torch finds none; use cpu")
 
 
 class ProgressLine:

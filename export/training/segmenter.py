@@ -31,7 +31,7 @@ from gcar_export.scenes.expert_pictures import (
 from gcar_export.scenes.picture_pool import pooled
 from gcar_export.training.loop import Lesson, Schedule, learn_together
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.run_folder import RunFolder
+from gcar_export.training.run_folder import RunFolder, check_device
 from gcar_export.training.segmenter_start import begin_with
 
 #: pictures with this seed are for choosing and reporting, never for training
@@ -290,7 +290,13 @@ def train(
     call with fewer ``steps``. Networks of ``options.folds`` are in folders within it. A new run
     begins with the weights of ``begin_from`` if given, a checkpoint or an ONNX model. Generated
     pictures are kept in ``pool``, by default in ``out``.
+
+    Raises
+    ------
+    UsageError
+        No CUDA device where the options name one.
     """
+    check_device(options.device)
     cv2.setNumThreads(1)
     real = real_pictures(options.real, options.fold)
 

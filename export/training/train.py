@@ -45,6 +45,7 @@ def start(
     """
     from gcar_export.training import multi as train_multi
     from gcar_export.training import paper as train_paper
+    from gcar_export.training.run_folder import check_device
 
     if network not in NETWORKS:
         raise UsageError(f"network {network!r} is none of {', '.join(NETWORKS)}")
@@ -63,22 +64,15 @@ def start(
     until = None if minutes is None else minutes * 60
     if network == "multi":
         options = dataclasses.replace(train_multi.PRESETS[preset], **changes)
-        _check_device(options.device)
+        check_device(options.device)
         train_multi.train(
             out, options, train_multi.CONFIGS[preset], until=until, labels=trees,
             label_hashes=hashes, warm_start=warm_start,
         )  # fmt: skip
     else:
         single = dataclasses.replace(train_paper.PRESETS[preset], **changes)
-        _check_device(single.device)
+        check_device(single.device)
         train_paper.train(
             out, single, train_paper.CONFIGS[preset], until=until, labels=trees,
             label_hashes=hashes,
         )  # fmt: skip
-
-
-def _check_device(device: str) -> None:
-    import torch
-
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise UsageError("preset gpu needs a CUDA device, and torch finds none; use cpu")

@@ -73,6 +73,14 @@ def test_no_file_of_a_model_is_replaced_unasked(tmp_path, verb, name):
     assert code == 2 and output.endswith("m.json: the file to write must end in .onnx\n")
 
 
+def test_a_preset_for_a_device_that_is_not_there_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for verb in ("train", "train-segmenter"):
+        code, output = said(verb, "--preset", "gpu", "--out", tmp_path / "run")
+        assert code == 2 and output.startswith("gcar-export: error: preset gpu needs a CUDA device")
+        assert not (tmp_path / "run").exists()
+
+
 def test_what_the_system_refuses_is_one_line_with_its_file(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device", "runs/a/log.csv")

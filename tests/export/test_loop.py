@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 
 from safetensors.torch import load_file  # noqa: E402
 
-from gcar_deploy.errors import UsageError  # noqa: E402
+from gcar_deploy.errors import ModelError, UsageError  # noqa: E402
 from gcar_export.training.loop import (  # noqa: E402
     Lesson,
     learn,
@@ -104,6 +104,19 @@ def test_a_run_does_not_go_on_with_other_options(tmp_path, key):
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(UsageError, match=r"\.safetensors has no manifest\.json beside it"):
         RunFolder(tmp_path, manifest())
+
+
+@pytest.mark.parametrize("damage", ["cut off", "another network"])
+def test_a_damaged_checkpoint_is_one_line(tmp_path, damage):
+    net = line()
+    learn(RunFolder(tmp_path, MANIFEST), net, options(steps=1), lesson(net, steps=1))
+    file = tmp_path / "checkpoint.safetensors"
+    if damage == "cut off":
+        file.write_bytes(file.read_bytes()[:-50])
+    else:
+        net = torch.nn.Linear(2, 1)
+    with pytest.raises(ModelError, match=r"checkpoint\.safetensors (cannot be read|does not fit)"):
+        learn(RunFolder(tmp_path, MANIFEST), net, options(steps=2), lesson(net, steps=2))
 
 
 def test_a_first_checkpoint_is_never_without_its_manifest(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 from gcar_deploy.cli.model_card import card
-from gcar_deploy.errors import ModelError, UsageError
+from gcar_deploy.errors import GcarError, ModelError, UsageError
 from gcar_deploy.models.session import Session
 from gcar_deploy.models.spec import read_model, shipped_model_path
 from gcar_deploy.predict.encoding import flat_inputs, input_names
@@ -243,6 +243,22 @@ def test_what_the_first_weights_were_trained_on_stays_said(tmp_path, monkeypatch
     assert kept == {"a": "2" * 64, "a (11111111)": "1" * 64}
     plain = _generation(tmp_path / "plain", {"license": OWN_LICENSE}, monkeypatch)
     assert plain["license"] == OWN_LICENSE
+
+
+def test_a_replicas_own_reason_is_told(tmp_path, monkeypatch):
+    traceback = "\n\n-- Process 1 terminated with the following error:\nTraceback:\n  File ...\n"
+
+    def ends(*_, **__):
+        raise torch.multiprocessing.ProcessRaisedException(traceback + last + "\n", 1, 123)
+
+    monkeypatch.setattr(torch.multiprocessing, "spawn", ends)
+    two = dataclasses.replace(PRESETS["tiny"], replicas=2)
+    last = "gcar_deploy.errors.ModelError: checkpoint c: cannot be read"
+    with pytest.raises(ModelError, match=r"^checkpoint c: cannot be read$"):
+        train(tmp_path, two, TINY)
+    last = "RuntimeError: no memory"
+    with pytest.raises(GcarError, match=r"^a replica ended: RuntimeError no memory$"):
+        train(tmp_path, two, TINY)
 
 
 def test_a_warm_start_of_another_size_is_refused(tmp_path):
