@@ -43,8 +43,16 @@ def read_label_trees(folder: Path) -> tuple[list[LabelTree], dict[str, str]]:
     files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(SUFFIXES))
     if not files:
         raise UsageError(f"{folder} holds no label volume ({', '.join(SUFFIXES)})")
-    trees = [label_tree(read_label(file)) for file in files]
+    trees = [_tree_of(file) for file in files]
     return trees, {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def _tree_of(file: Path) -> LabelTree:
+    label = read_label(file)
+    try:
+        return label_tree(label)
+    except UsageError as error:
+        raise UsageError(f"{file}: {str(error).removeprefix(f'{label.name}: ')}") from None
 
 
 def label_tree(label: LabelVolume) -> LabelTree:

@@ -64,7 +64,7 @@ def load_checkpoint(path: Path) -> SparsePredictor | UNetPredictor:
     ModelError
         Either is damaged, or they do not belong together.
     """
-    manifest = read_manifest(path)
+    manifest = read_manifest(path, ("sparse", "unet"))
     config = dict(manifest["config"])
     net: SparsePredictor | UNetPredictor
     try:

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_deploy.imaging.line_strips import NEAR, POINT, line_points
@@ -32,7 +31,7 @@ from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.parity import PARITY
-from gcar_export.training.checkpoint import best_weights, filled, read_manifest, read_tensors
+from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.segmenter_start import begin_with, devices_of
@@ -84,25 +83,42 @@ class _Deployed(torch.nn.Module):
 
 
 def load_segmenter_checkpoint(path: Path) -> MaskUNet:
-    """Read ``checkpoint.safetensors`` beside its ``manifest.json``, or an ONNX segmenter."""
+    """Read ``checkpoint.safetensors`` beside its ``manifest.json``, or an ONNX segmenter.
+
+    Raises
+    ------
+    ModelError
+        Damaged, or of another network.
+    """
     if path.suffix == ".onnx":
         net = MaskUNet(MaskUNetConfig())
         begin_with(net, path)
         return net.eval()
-    config = dict(json.loads((path.parent / "manifest.json").read_text())["config"])
-    config["width"] = tuple(config["width"])
-    net = MaskUNet(MaskUNetConfig(**config))
-    net.load_state_dict(best_weights(load_file(path)))
+    config = dict(read_manifest(path, ("mask-unet",))["config"])
+    try:
+        net = MaskUNet(MaskUNetConfig(**{**config, "width": tuple(config["width"])}))
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
+    filled(net, read_tensors(path), path.name)
     return net.eval()
 
 
 def load_device_checkpoint(path: Path) -> LineNet:
-    """Read the checkpoint of ``training.devices`` beside its manifest, or an ONNX model's."""
+    """Read the checkpoint of ``training.devices`` beside its manifest, or an ONNX model's.
+
+    Raises
+    ------
+    ModelError
+        Damaged, or of another network.
+    """
     if path.suffix == ".onnx":
         net = LineNet(LineNetConfig())
         devices_of(net, path)
         return net.eval()
-    net = LineNet(LineNetConfig(**read_manifest(path)["config"]))
+    try:
+        net = LineNet(LineNetConfig(**read_manifest(path, ("line-net",))["config"]))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
     filled(net, read_tensors(path), path.name)
     return net.eval()
 

@@ -7,7 +7,7 @@ beside it. Pickled checkpoints (``.pt``, ``.pth``) are programs and are not read
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,13 @@ MAX_MANIFEST_BYTES = 64 * 2**10
 MAX_WIDTH = 4096
 #: what names of weights begin with, and of their mean (``mean_weights``) where one was kept
 WEIGHTS, MEAN = "net.", "mean."
+#: network of a manifest -> what its checkpoint is of, and what takes it
+_TAKEN_BY = {
+    "sparse": ("a predictor", "export"),
+    "unet": ("a predictor", "export"),
+    "mask-unet": ("the segmenter", "export-segmenter"),
+    "line-net": ("the device network", "export-segmenter --devices"),
+}
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -48,13 +55,18 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     return tensors
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path, networks: Sequence[str] = ()) -> dict[str, Any]:
     """Read the ``manifest.json`` beside the checkpoint ``path``, strictly.
+
+    Parameters
+    ----------
+    path : of the checkpoint
+    networks : that the caller can use; any without
 
     Raises
     ------
     ModelError
-        Missing, not JSON, or sizes of the network out of range.
+        Missing, not JSON, of another network, or sizes of the network out of range.
     """
     file = path.parent / "manifest.json"
     try:
@@ -63,6 +75,10 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise ModelError(f"{file.name} of {path.name} cannot be read: {_line(error)}") from None
     if not isinstance(found, dict) or not isinstance(found.get("config"), dict):
         raise ModelError(f"{file.name} of {path.name} has no config")
+    network = found.get("network", "sparse")
+    if networks and network not in networks and network in _TAKEN_BY:
+        what, verb = _TAKEN_BY[network]
+        raise ModelError(f"{path} is a checkpoint of {what}: use it with {verb}")
     for key, value in found["config"].items():
         for size in value if isinstance(value, list) else [value]:
             whole = isinstance(size, int) and not isinstance(size, bool)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file
 
 from gcar_deploy.errors import ModelError
-from gcar_export.training.checkpoint import WEIGHTS, best_weights
+from gcar_export.training.checkpoint import WEIGHTS, best_weights, read_tensors
 from gcar_export.training.networks.line_net import LineNet
 from gcar_export.training.networks.mask_unet import MaskUNet
 
@@ -23,10 +23,10 @@ def begin_with(net: MaskUNet, path: Path) -> str:
     Raises
     ------
     ModelError
-        A weight is missing or has another shape.
+        The file is damaged; a weight is missing or has another shape.
     """
     found = (
-        model_weights(path, WEIGHTS) if path.suffix == ".onnx" else best_weights(load_file(path))
+        model_weights(path, WEIGHTS) if path.suffix == ".onnx" else best_weights(read_tensors(path))
     )
     own = net.state_dict()
     for name, value in own.items():
@@ -47,15 +47,14 @@ def devices_of(net: LineNet, model: Path) -> str:
     Raises
     ------
     ModelError
-        The model holds none, or one of another size.
+        The file is no ONNX model, or holds none or one of another size.
     """
-    import onnx
     from onnx import numpy_helper
 
     prefix = "devices."
     found = {
         one.name.removeprefix(prefix): torch.from_numpy(numpy_helper.to_array(one).copy())
-        for one in onnx.load(str(model)).graph.initializer
+        for one in _graph(model).initializer
         if one.name.startswith(prefix)
     }
     try:
@@ -63,6 +62,16 @@ def devices_of(net: LineNet, model: Path) -> str:
     except RuntimeError:
         raise ModelError(f"{model.name} holds no network of lines of this size") from None
     return hashlib.sha256(model.read_bytes()).hexdigest()
+
+
+def _graph(model: Path) -> Any:
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        return onnx.load(str(model)).graph
+    except DecodeError:
+        raise ModelError(f"{model} is no ONNX model") from None
 
 
 def vessels_sha256(model: Path) -> str:
@@ -77,11 +86,15 @@ def model_weights(path: Path, prefix: str) -> dict[str, torch.Tensor]:
     """Read one network's weights out of an ONNX model: those whose names begin with ``prefix``.
 
     Convolutions keep their names; what scales and shifts after each follows in its order.
+
+    Raises
+    ------
+    ModelError
+        The file is no ONNX model.
     """
-    import onnx
     from onnx import numpy_helper
 
-    graph = onnx.load(str(path)).graph
+    graph = _graph(path)
     arrays = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
     found = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
     layer = ""

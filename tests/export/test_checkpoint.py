@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pickle
 
@@ -13,9 +14,12 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from gcar_deploy.errors import ModelError  # noqa: E402
+from gcar_deploy.imaging.net import KIND  # noqa: E402
 from gcar_export.cli.main import main  # noqa: E402
 from gcar_export.shipping.export_onnx import load_checkpoint  # noqa: E402
+from gcar_export.shipping.export_segmenter import load_segmenter_checkpoint  # noqa: E402
 from gcar_export.shipping.tiny_model import write_tiny_checkpoint  # noqa: E402
+from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig  # noqa: E402
 
 
 @pytest.fixture
@@ -105,3 +109,48 @@ def test_the_command_says_it_in_one_line_and_leaves_nothing(checkpoint, tmp_path
     assert done.exit_code == 5 and "Traceback" not in done.output
     assert done.output.startswith("gcar-export: error: checkpoint") and done.output.count("\n") == 1
     assert not out.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("network", "words", "said"),
+    [("mask-unet", "export", "the segmenter: use it with export-segmenter"),
+     ("line-net", "export", "the device network: use it with export-segmenter --devices"),
+     ("sparse", "export-segmenter", "a predictor: use it with export"),
+     ("line-net", "export-segmenter", "the device network: use it with export-segmenter --devices"),
+     ("mask-unet", "export-segmenter MODEL --devices", "the segmenter: use it with "
+      "export-segmenter"),
+     ("unet", "export-segmenter MODEL --devices", "a predictor: use it with export")],
+)  # fmt: skip
+def test_a_checkpoint_of_another_kind_is_sent_where_it_belongs(checkpoint, network, words, said):
+    file = checkpoint.parent / "manifest.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"network": network}))
+    out = checkpoint.parent / "out" / "m.onnx"
+    given = [str(KIND.path) if word == "MODEL" else word for word in words.split()]
+    done = CliRunner().invoke(main, [*given, str(checkpoint), "--out", str(out)])
+    assert (done.exit_code, done.output) == (
+        5, f"gcar-export: error: {checkpoint} is a checkpoint of {said}\n"
+    )  # fmt: skip
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize("damage", ["cut off", "no manifest", "a layer missing", "a wide network"])
+def test_wrong_checkpoints_of_the_segmenter_are_refused(tmp_path, damage):
+    net = MaskUNet(MaskUNetConfig())
+    path = tmp_path / "checkpoint.safetensors"
+    save_file({f"net.{k}": v.contiguous() for k, v in net.state_dict().items()}, path)
+    manifest = {"network": "mask-unet", "config": dataclasses.asdict(net.config)}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    load_segmenter_checkpoint(path)
+    WRONG[damage](path)
+    with pytest.raises(ModelError):
+        load_segmenter_checkpoint(path)
+
+
+@pytest.mark.parametrize("verb", ["train-segmenter", "train-devices"])
+def test_first_weights_that_cannot_be_read_are_one_line(tmp_path, verb):
+    for name in ("torn.onnx", "torn.safetensors"):
+        (tmp_path / name).write_bytes(b"no weights at all")
+        given = ["--warm-start", str(tmp_path / name), "--out", str(tmp_path / "run")]
+        done = CliRunner().invoke(main, [verb, *given])
+        assert done.exit_code == 5 and done.output.count("\n") == 1, done.output
+        assert name in done.output and "internal" not in done.output

@@ -92,6 +92,14 @@ def test_two_parts_are_two_sides():
     assert np.ptp(tree.whole.starts[:, 0]) > 40 > np.ptp(tree.sides[0].starts[:, 0])
 
 
+def test_a_volume_without_a_vessel_is_named_by_its_file(tmp_path):
+    volume = np.zeros((9, 9, 9), np.uint8)
+    volume[4, 4, 4] = 1
+    nibabel.save(nibabel.Nifti1Image(volume, np.diag([0.5, 0.5, 0.5, 1])), tmp_path / "dot.nii.gz")
+    with pytest.raises(UsageError, match=r"^/.*/dot\.nii\.gz: no vessel is long enough"):
+        read_label_trees(tmp_path)
+
+
 def test_scenes_show_labels_about_as_often_as_asked(folder):
     trees, hashes = read_label_trees(folder)
     assert sorted(hashes) == ["a.nii.gz", "b.mha"] and len(trees) == 2
