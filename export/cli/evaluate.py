@@ -47,6 +47,17 @@ class _Progress:
             self._bar.render_finish()
 
 
+def _list_methods(ctx: click.Context, _: click.Parameter, methods: str) -> str:
+    """List the methods if that is asked for; nothing else has to be given then."""
+    if methods == "help":
+        from gcar_export.methods.settings import DESCRIPTIONS
+
+        for name, text in DESCRIPTIONS.items():
+            click.echo(f"{name:20} {text}")
+        ctx.exit()
+    return methods
+
+
 @click.command()
 @click.option("--data", type=_FOLDER, help="Folder with imagecas/, asoca/ or masks; not for thin.")
 @click.option(
@@ -61,6 +72,8 @@ class _Progress:
     "--methods",
     default="ours,multi,hull+tube,hull,visual_hull,fdk,sart,nerp",
     show_default=True,
+    is_eager=True,
+    callback=_list_methods,
     help="Comma-separated; the first is the one the others are tested against. 'help' lists all.",
 )
 @click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
@@ -113,12 +126,8 @@ def evaluate(
     from gcar_export.evaluate import peers
     from gcar_export.evaluate import tables as evaluation_tables
     from gcar_export.evaluate.report import draw
-    from gcar_export.methods.settings import DESCRIPTIONS, MethodSettings
+    from gcar_export.methods.settings import MethodSettings
 
-    if methods == "help":
-        for name, text in DESCRIPTIONS.items():
-            click.echo(f"{name:20} {text}")
-        return
     options = evaluation.EvaluateOptions(
         data=data,
         out=out,

@@ -7,7 +7,7 @@
     <!-- end -->
 
 from ``RESULTS/NAME/cases.csv``, which ``gcar-export evaluate --out RESULTS/NAME`` left. The block
-``overview`` has a line per protocol of ``OVERVIEW`` whose folder is there.
+``overview`` has a line per protocol of ``OVERVIEW``; without its folder the line stays as it is.
 """
 
 from __future__ import annotations
@@ -34,19 +34,24 @@ _SHOWN = ("dsc", "cldice", "chamfer_mm", "cpu_seconds")
 _BLOCK = re.compile(r"(<!-- figures: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
-def overview(results: Path, method: str = "ours") -> str:
-    """One line per evaluated folder: what was given, mean and SD of the main measures, statuses."""
+def overview(results: Path, before: str = "", method: str = "ours") -> str:
+    """One line per evaluated folder: what was given, mean and SD of the main measures, statuses.
+
+    The line of a protocol without rows in ``results`` is that of the table ``before``.
+    """
+    old = {line.split(" | ")[0].strip("| "): line for line in before.splitlines()}
     columns = {name: {**tables.MEASURES, **tables.COUNTS}[name] for name in _SHOWN}
     head = ["given", "trees", *(c.heading for c in columns.values()), "ok / degraded / refused"]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, given in OVERVIEW.items():
         file = results / name.split("-")[0] / "cases.csv"
-        if not file.is_file():
-            continue
         rows = [
-            row for row in tables.read_case_rows(file)
+            row for row in (tables.read_case_rows(file) if file.is_file() else [])
             if (row["protocol"], row["method"]) == (name, method)
         ]  # fmt: skip
+        if not rows:
+            lines += [old[given]] if given in old else []
+            continue
         (entry,) = tables.summarise(rows)
         cells = [tables.mean_sd(entry[key], column, len(rows)) for key, column in columns.items()]
         lines.append("| " + " | ".join([given, str(len(rows)), *cells, _statuses(rows)]) + " |")
@@ -60,7 +65,7 @@ def filled(text: str, results: Path) -> tuple[str, list[str]]:
     def fill(block: re.Match[str]) -> str:
         name = block[2]
         if name == "overview":
-            return f"{block[1]}{overview(results)}{block[4]}"
+            return f"{block[1]}{overview(results, block[3])}{block[4]}"
         file = results / name / "cases.csv"
         if not file.is_file():
             missing.append(name)

@@ -81,6 +81,12 @@ def test_a_preset_for_a_device_that_is_not_there_is_one_line(tmp_path, monkeypat
         assert not (tmp_path / "run").exists()
 
 
+def test_methods_are_listed_without_anything_else():
+    code, output = said("evaluate", "--methods", "help")
+    assert code == 0 and "\nvisual_hull " in output
+    assert said("evaluate", "--methods", "ours")[0] == 2
+
+
 def test_what_the_system_refuses_is_one_line_with_its_file(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device", "runs/a/log.csv")

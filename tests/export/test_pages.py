@@ -9,6 +9,7 @@ from tests.export.test_evaluate import _row
 PAGE = """before
 <!-- figures: overview -->
 old
+| raw 8-bit pictures of the same | 9 | as it was |
 <!-- end -->
 between
 <!-- figures: paper -->
@@ -35,5 +36,6 @@ def test_blocks_are_filled_and_the_rest_stays(tmp_path):
     (line,) = [line for line in lines if line.startswith("| path lengths 128")]
     # by hand: mean of 50 and 70 with SD 14.14, of 25 and 75 with SD 35.36
     assert "| 2 | 60.00 ± 14.14 | 50.00 ± 35.36 | - | 2.00 ± 0.00 | 1 / 1 / 0 |" in line
+    assert lines.index("| raw 8-bit pictures of the same | 9 | as it was |") > lines.index(line)
     assert "| hull | 10.00 (n=1)" in text
     assert filled(text, tmp_path)[0] == text
