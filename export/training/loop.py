@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from gcar_export.training.mean_weights import MeanWeights
-from gcar_export.training.run_folder import ProgressLine, RunFolder
+from gcar_export.training.run_folder import ProgressLine, RunFolder, until_interrupted
 
 N = TypeVar("N", bound=torch.nn.Module)
 B = TypeVar("B")
@@ -108,26 +108,38 @@ def learn_together(
 
     What a network must not learn from a batch its own loss leaves out. Each ends as it would have
     alone.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C, when all are saved.
     """
+    if all(folder.finished(options.steps) for folder, _, _ in pupils):
+        return
     runs = [_Run(folder, net, options, lesson) for folder, net, lesson in pupils]
     step = min(run.step for run in runs)
     line = ProgressLine(step, options.steps, options.batch, "pictures")
     began = time.monotonic()
-    for batch in pupils[0][2].batches(step):
-        if minutes is not None and time.monotonic() - began > 60 * minutes:
-            break
-        for run in runs:
-            # An interruption between two checkpoints leaves one network ahead.
-            if run.step == step:
-                run.take(batch)
-        step += 1
-        if line.due(step):
-            line.show(step, runs[0].recent())
-        if step % options.save_every == 0 and step < options.steps:
+    with until_interrupted() as stop:
+        for batch in pupils[0][2].batches(step):
+            if stop.is_set() or (minutes is not None and time.monotonic() - began > 60 * minutes):
+                break
             for run in runs:
+                # An interruption between two checkpoints leaves one network ahead.
+                if run.step == step:
+                    run.take(batch)
+            step += 1
+            if line.due(step):
+                line.show(step, runs[0].recent())
+            if step % options.save_every == 0 and step < options.steps:
+                for run in runs:
+                    run.save()
+        for run in runs:
+            if stop.is_set():
                 run.save()
-    for run in runs:
-        run.finish()
+                run.folder.interrupt(run.step)
+            else:
+                run.finish()
 
 
 class _Run(Generic[N, B]):

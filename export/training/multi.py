@@ -31,8 +31,8 @@ from gcar_export.training.dataset import TrainingScene, training_scene
 from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
-from gcar_export.training.run_folder import ProgressLine, RunFolder
-from gcar_export.training.scene_stream import in_order
+from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, until_interrupted
+from gcar_export.training.scene_stream import in_order, leave_interrupts_to_the_parent
 from gcar_export.training.warm_start import inherited, predictor_of
 
 #: scenes with this seed are for choosing and reporting, never for training
@@ -202,20 +202,30 @@ def train(
         ``out`` holds a run of another network, size, seed, set of labels or first weights.
     ModelError
         ``warm_start`` is no multi-view predictor, or one of another size.
+    KeyboardInterrupt
+        On Ctrl-C, when the run is saved.
     """
     job = _Job(
         out, options, config or SparseConfig(), until, tuple(labels), dict(label_hashes or {}),
         warm_start,
     )  # fmt: skip
-    _run_folder(job)
-    if options.replicas == 1:
-        _replica(0, job)
+    if _run_folder(job).finished(options.steps):
+        return
+    stop = torch.multiprocessing.get_context("spawn").Event()
+    with until_interrupted(stop):
+        _replicas(job, stop)
+
+
+def _replicas(job: _Job, stop: Flag) -> None:
+    count = job.options.replicas
+    if count == 1:
+        _replica(0, job, stop)
         return
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         job = dataclasses.replace(job, port=probe.getsockname()[1])
     try:
-        torch.multiprocessing.spawn(_replica, args=(job,), nprocs=options.replicas, join=True)
+        torch.multiprocessing.spawn(_replica, args=(job, stop), nprocs=count, join=True)
     except torch.multiprocessing.ProcessRaisedException as error:
         raise _reason_of(error) from error
 
@@ -243,9 +253,11 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _replica(rank: int, job: _Job) -> None:
+def _replica(rank: int, job: _Job, stop: Flag) -> None:
     _end_with_parent()
     options, scenes = job.options, SceneOptions()
+    if options.replicas > 1:
+        leave_interrupts_to_the_parent()
     torch.set_num_threads(1 if options.replicas > 1 else torch.get_num_threads())
     if options.replicas > 1:
         torch.distributed.init_process_group(
@@ -278,7 +290,7 @@ def _replica(rank: int, job: _Job) -> None:
     with in_order(draw, numbers, options.workers) as drawn:
         while step < options.steps:
             out_of_time = job.until is not None and time.monotonic() - began > job.until
-            if _any(out_of_time, options.replicas):
+            if _any(out_of_time or stop.is_set(), options.replicas):
                 break
             scene = next(drawn)
             for group in optimiser.param_groups:
@@ -304,6 +316,8 @@ def _replica(rank: int, job: _Job) -> None:
                 _tell(step, scores)
     if rank == 0:
         run.save(net, optimiser, step, mean=mean.net)
+        if stop.is_set():
+            run.interrupt(step)
     if options.replicas > 1:
         torch.distributed.destroy_process_group()
 

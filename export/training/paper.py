@@ -22,7 +22,7 @@ from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training import losses
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.paper_dataset import POSES, VIEWS, TrainingPicture, training_pictures
-from gcar_export.training.run_folder import ProgressLine, RunFolder
+from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, until_interrupted
 
 #: trees with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -218,8 +218,19 @@ def train(
     ------
     UsageError
         ``out`` holds a run of another network, size, seed or set of labels.
+    KeyboardInterrupt
+        On Ctrl-C, when the run is saved.
     """
     run = RunFolder(out, _manifest(options, config, label_hashes or {}))
+    if not run.finished(options.steps):
+        with until_interrupted() as stop:
+            _train(run, options, config, until, labels, stop)
+
+
+def _train(
+    run: RunFolder, options: PaperTraining, config: UNetConfig, until: float | None,
+    labels: Sequence[LabelTree], stop: Flag,
+) -> None:  # fmt: skip
     torch.manual_seed(options.seed)
     net = UNetPredictor(config).to(options.device)
     # The stubs do not know this keyword of a module.
@@ -237,7 +248,7 @@ def train(
     line = ProgressLine(step, options.steps, options.trees * VIEWS, "pictures")
     began, recent, skipped = time.monotonic(), [], 0
     while step < options.steps:
-        if until is not None and time.monotonic() - began > until:
+        if stop.is_set() or (until is not None and time.monotonic() - began > until):
             break
         drawn = [
             p
@@ -271,6 +282,8 @@ def train(
             run.keep_best(step, error, scores)
             _tell(step, scores)
     run.save(net, optimiser, step)
+    if stop.is_set():
+        run.interrupt(step)
 
 
 def _precision(options: PaperTraining) -> contextlib.AbstractContextManager[Any]:

@@ -8,15 +8,18 @@ Each file is replaced whole, so an interruption at any moment leaves a folder to
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
 import platform
 import shutil
+import signal
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import click
 import numpy as np
@@ -52,6 +55,7 @@ class RunFolder:
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
         self.path = path
         self.manifest: dict[str, Any] = {"schema": SCHEMA, **manifest}
+        self._scored = -1
         self._check_same()
         path.mkdir(parents=True, exist_ok=True)
 
@@ -86,6 +90,15 @@ class RunFolder:
                 )
         if "best" in before:
             self.manifest["best"] = before["best"]
+        if self.checkpoint.is_file() and "validation" in before:
+            self._scored = int(before.get("step", 0))
+
+    def finished(self, steps: int) -> bool:
+        """Whether all steps were taken and scored before; says so."""
+        done = self._scored >= steps
+        if done:
+            click.echo(f"{self.path} is finished: {self._scored} steps", err=True)
+        return done
 
     def resume(
         self,
@@ -156,6 +169,10 @@ class RunFolder:
         os.replace(partial, self.checkpoint)
         self._write_manifest()
 
+    def interrupt(self, step: int) -> None:
+        """Say where a run that was interrupted goes on."""
+        click.echo(f"{self.path} is saved at step {step}; the same command goes on", err=True)
+
     def keep_best(self, step: int, error: float, scores: Mapping[str, Any]) -> None:
         """Copy the checkpoint just saved to best.safetensors if no earlier error was lower."""
         if error >= self.manifest.get("best", {"error": np.inf})["error"]:
@@ -202,6 +219,44 @@ def check_device(device: str) -> None:
     """
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise UsageError("preset gpu needs a CUDA device, and torch finds none; use cpu")
+
+
+class Flag(Protocol):
+    """What ``threading.Event`` and that of ``multiprocessing`` have in common."""
+
+    def set(self) -> None:
+        """Raise it."""
+
+    def is_set(self) -> bool:
+        """Tell whether it is up."""
+
+
+@contextlib.contextmanager
+def until_interrupted(stop: Flag | None = None) -> Iterator[Flag]:
+    """Give a flag that Ctrl-C raises: the training saves after its step. Again ends at once.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the end, where the flag is up.
+    """
+    stop = stop or threading.Event()
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupted(*_: object) -> None:
+        signal.signal(signal.SIGINT, before)
+        stop.set()
+
+    if main:
+        signal.signal(signal.SIGINT, interrupted)
+    try:
+        yield stop
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, before)
+    if stop.is_set():
+        raise KeyboardInterrupt
 
 
 class ProgressLine:

@@ -7,6 +7,7 @@ import concurrent.futures
 import contextlib
 import itertools
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
@@ -31,11 +32,18 @@ def in_order(
         yield map(draw, numbers)
         return
     spawn = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn)
+    pool = concurrent.futures.ProcessPoolExecutor(
+        workers, mp_context=spawn, initializer=leave_interrupts_to_the_parent
+    )
     try:
         yield _ahead(pool, draw, iter(numbers), AHEAD * workers)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def leave_interrupts_to_the_parent(*_: object) -> None:
+    """Ignore Ctrl-C in this process: the one that started it ends it when its work is saved."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _ahead(

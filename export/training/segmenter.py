@@ -32,6 +32,7 @@ from gcar_export.scenes.picture_pool import pooled
 from gcar_export.training.loop import Lesson, Schedule, learn_together
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.run_folder import RunFolder, check_device
+from gcar_export.training.scene_stream import leave_interrupts_to_the_parent
 from gcar_export.training.segmenter_start import begin_with
 
 #: pictures with this seed are for choosing and reporting, never for training
@@ -238,7 +239,7 @@ def batches(
     ]
     loader = torch.utils.data.DataLoader(
         Stream(options, pool, real), batch_sampler=order, num_workers=workers,
-        pin_memory=options.device != "cpu",
+        pin_memory=options.device != "cpu", worker_init_fn=leave_interrupts_to_the_parent,
     )  # fmt: skip
     for x, y, numbers in loader:
         yield [a.to(options.device, non_blocking=True) for a in (x, y)] + [numbers]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -117,6 +118,41 @@ def test_a_damaged_checkpoint_is_one_line(tmp_path, damage):
         net = torch.nn.Linear(2, 1)
     with pytest.raises(ModelError, match=r"checkpoint\.safetensors (cannot be read|does not fit)"):
         learn(RunFolder(tmp_path, MANIFEST), net, options(steps=2), lesson(net, steps=2))
+
+
+def test_an_interrupt_saves_where_it_is_and_a_second_ends_at_once(tmp_path, capsys):
+    net = line()
+    own = lesson(net)
+
+    def pressed(times):
+        def batches(first):
+            for k in range(first, 60):
+                if k == first + 3:
+                    for _ in range(times):
+                        signal.raise_signal(signal.SIGINT)
+                yield k
+
+        return dataclasses.replace(own, batches=batches)
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        learn(RunFolder(tmp_path, MANIFEST), net, options(), pressed(1))
+    assert f"{tmp_path} is saved at step 3; the same command goes on" in capsys.readouterr().err
+    assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 3
+    assert json.loads((tmp_path / "manifest.json").read_text())["step"] == 3
+    with pytest.raises(KeyboardInterrupt):
+        learn(RunFolder(tmp_path, MANIFEST), net, options(save_every=50), pressed(2))
+    assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 3
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_a_finished_run_says_that_it_is(tmp_path, capsys):
+    net = line()
+    for steps in (2, 2, 3):
+        folder = RunFolder(tmp_path, MANIFEST)
+        learn(folder, net, options(steps=steps), lesson(net, steps=steps))
+    assert capsys.readouterr().err.count(f"{tmp_path} is finished: 2 steps") == 1
+    assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 3
 
 
 def test_a_first_checkpoint_is_never_without_its_manifest(tmp_path, monkeypatch):

@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -169,6 +171,34 @@ def test_replicas_end_with_their_parent(tmp_path):
     while any(Path(f"/proc/{pid}/cmdline").exists() and _alive(pid) for pid in replicas):
         assert time.monotonic() < until
         time.sleep(0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("replicas", [1, 2])
+def test_an_interrupt_of_all_processes_saves_the_run(tmp_path, replicas):
+    """Ctrl-C in a terminal reaches the replicas as well."""
+    code = (
+        "import dataclasses, pathlib, sys\nfrom gcar_export.training.multi import *\n"
+        "if __name__ == '__main__':\n"
+        f"    o = dataclasses.replace(PRESETS['tiny'], steps=100000, replicas={replicas})\n"
+        "    o = dataclasses.replace(o, validation_scenes=1, save_every=10**6)\n"
+        "    train(pathlib.Path(sys.argv[1]), o, CONFIGS['tiny'])\n"
+    )
+    program = tmp_path / "train.py"
+    program.write_text(code)
+    with subprocess.Popen(
+        [sys.executable, str(program), str(tmp_path / "run")], start_new_session=True,
+        stderr=subprocess.PIPE, text=True,
+    ) as parent:  # fmt: skip
+        for text in parent.stderr:
+            if text.startswith("step "):
+                os.killpg(parent.pid, signal.SIGINT)
+                break
+        said = parent.stderr.read()
+        assert parent.wait(60) != 0
+    step = int(load_file(tmp_path / "run/checkpoint.safetensors")["step"])
+    assert step >= 25 and f"is saved at step {step}; the same command goes on" in said
+    assert "Process" not in said
 
 
 def _alive(pid):
