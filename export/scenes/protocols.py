@@ -175,7 +175,7 @@ def make_case(label: LabelVolume, protocol: str, views: int = 2) -> Case:
 
 
 def write_case(case: Case, folder: Path) -> list[Path]:
-    """Write ``view1.png`` ..., ``geom.json`` and ``truth.nii.gz``; return the pictures' paths."""
+    """Write ``view1.png`` ..., ``geom.json`` and ``truth.nii.gz``; return their paths."""
     import cv2
     import nibabel
 
@@ -188,9 +188,10 @@ def write_case(case: Case, folder: Path) -> list[Path]:
             raise UsageError(f"cannot encode {path}")
         path.write_bytes(blob.tobytes())
         paths.append(path)
-    (folder / "geom.json").write_text(scene_to_json(case.scene))
-    nibabel.save(nibabel.Nifti1Image(case.truth, case.grid.affine_ras()), folder / "truth.nii.gz")
-    return paths
+    geometry, truth = folder / "geom.json", folder / "truth.nii.gz"
+    geometry.write_text(scene_to_json(case.scene))
+    nibabel.save(nibabel.Nifti1Image(case.truth, case.grid.affine_ras()), truth)
+    return [*paths, geometry, truth]
 
 
 def case_geometry(protocol: str, views: int) -> tuple[list[CArm], Grid]:

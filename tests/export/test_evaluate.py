@@ -155,7 +155,8 @@ def test_case_folder_round_trip(data, tmp_path):
     from gcar_deploy.geometry.scene import load_scene
 
     case = make_case(read_label(data / "imagecas" / "1.label.nii.gz"), "clinical")
-    write_case(case, tmp_path)
+    written = write_case(case, tmp_path)
+    assert sorted(written) == sorted(tmp_path.iterdir())
     scene = load_scene(tmp_path / "geom.json")
     assert [v.carm for v in scene.views] == case.scene_carms
     truth = nibabel.load(tmp_path / "truth.nii.gz")
