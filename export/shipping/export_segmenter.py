@@ -30,6 +30,7 @@ from gcar_deploy.models import Session, golden_path
 from gcar_deploy.types import Array
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
+from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.parity import PARITY
 from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
@@ -159,7 +160,7 @@ def shipped() -> Path:
 def export_segmenter(
     checkpoint: Path, out: Path, pictures: int = 4, devices: Path | None = None
 ) -> float:
-    """Write ``out`` (.onnx) and its spec (.json).
+    """Write ``out`` (.onnx), its spec (.json) and its golden case.
 
     Parameters
     ----------
@@ -217,6 +218,7 @@ def export_segmenter(
         raise ModelError(
             f"{out.name} differs from its checkpoint by {worst:.1e} (at most {PARITY:g})"
         )
+    write_golden(out, force=True)
     return worst
 
 

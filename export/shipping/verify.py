@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from gcar_deploy.imaging.net import KIND as SEGMENTER
+from gcar_deploy.imaging.net import Segmenter, open_segmenter
+from gcar_deploy.models import read_model
 from gcar_deploy.predict.center_predictor import open_predictor
-from gcar_deploy.predict.kinds import PAPER, read_predictor
+from gcar_deploy.predict.kinds import PAPER, PREDICTORS
+from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.task_check import REACH_PIXELS, scores
+
+#: seed of the pictures that a segmenter is asked for; no training or validation draws from it
+PICTURE_SEED = 80_002
 
 
 def verify_model(path: Path, scenes: int) -> str:
     """Run ``scenes`` generated scenes and say how well their vessel is found; see ``task_check``.
+
+    A segmenter is asked for as many generated angiograms.
 
     Raises
     ------
@@ -21,17 +31,22 @@ def verify_model(path: Path, scenes: int) -> str:
     """
     from gcar_deploy.cli.model_card import card
 
-    model = read_predictor(path)
+    model = read_model(path, (*PREDICTORS.values(), SEGMENTER))
     found: dict[str, list[float]] = {}
-    for kind, score in scores(model, scenes):
-        found.setdefault(kind, []).append(score)
-    named = (
-        f"share of lone centres within {REACH_PIXELS:g} pixels"
-        if model.kind == PAPER.name
-        else "Dice at 0.5 on the hull"
-    )
+    named = "Dice at 0.5 on the hull"
+    if model.kind == SEGMENTER.name:
+        named = "Dice at 0.5"
+        segmenter = open_segmenter(path, threads=1)
+        session = segmenter.session
+        found["angiograms"] = list(_dice(segmenter, scenes))
+    else:
+        session = open_predictor(model, threads=1).session
+        if model.kind == PAPER.name:
+            named = f"share of lone centres within {REACH_PIXELS:g} pixels"
+        for kind, score in scores(model, scenes):
+            found.setdefault(kind, []).append(score)
     lines = card(model)
-    worst = open_predictor(model, threads=1).session.check_golden()
+    worst = session.check_golden()
     lines.append(
         "no golden case beside it"
         if worst is None
@@ -42,3 +57,12 @@ def verify_model(path: Path, scenes: int) -> str:
         f"  {kind}: {named} {np.mean(v):.3f} ({len(v)} scenes)" for kind, v in sorted(found.items())
     ]
     return "\n".join(lines)
+
+
+def _dice(segmenter: Segmenter, pictures: int) -> Iterator[float]:
+    """Dice at 0.5 of each picture, where its truth is sure."""
+    for k in range(pictures):
+        channels, truth = training_pair(PICTURE_SEED, k)
+        asked = truth[1] > 0
+        seen, true = ((m >= 0.5) & asked for m in (segmenter.look(channels).probability, truth[0]))
+        yield 2 * float((seen & true).sum()) / max(float(seen.sum() + true.sum()), 1.0)

@@ -24,9 +24,11 @@ def info(path: Path, as_json: bool) -> None:
 
     if path.suffix == ".onnx":
         from gcar_deploy.cli.model_card import card
-        from gcar_deploy.predict import read_predictor
+        from gcar_deploy.imaging.net import KIND as SEGMENTER
+        from gcar_deploy.models import read_model
+        from gcar_deploy.predict import PREDICTORS
 
-        model = read_predictor(path)
+        model = read_model(path, (*PREDICTORS.values(), SEGMENTER))
         click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))
         return
     from gcar_deploy.output.stored import read_summary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,12 +13,14 @@ def card(model: ModelFile) -> list[str]:
     """Return the card for people, one line a fact."""
     spec = model.spec
     training = spec.get("training", {})
+    centers = "Gaussian centre predictor"
     what = {
-        "multi": "all views at once: which hull points are vessel",
-        "paper": "the paper's: one view at a time, a depth and an offset per cell",
+        "multi": f"{centers} (all views at once: which hull points are vessel)",
+        "paper": f"{centers} (the paper's: one view at a time, a depth and an offset per cell)",
+        "segmenter": "segmenter (which pixels are vessel, their chords, which lines are devices)",
     }[model.kind]
     out = [
-        f"{model.name}: Gaussian centre predictor ({what})",
+        f"{model.name}: {what}",
         f"  SHA-256 {model.sha256}, as its spec says",
         f"  {spec.get('parameters', 0):,} parameters, {len(model.data):,} bytes, "
         f"{spec.get('precision', 'float32')}, opset {spec.get('opset')}, "
@@ -26,19 +29,30 @@ def card(model: ModelFile) -> list[str]:
         f"  answers: {', '.join(spec.get('outputs', ()))}",
         f"  cells or pixels of {_range(spec.get('spacing_mm'))} mm at the isocentre"
         + (f"; {spec['geometry']}" if "geometry" in spec else ""),
-        f"  trained on: {training.get('data', 'unknown')}; seed "
-        f"{training.get('seed', training.get('options', {}).get('seed', '?'))}, "
-        f"{training.get('step', '?')} steps",
+        f"  trained on: {_trained(training)}",
     ]
+    if "devices" in training:
+        out.append(f"  devices: trained on {_trained(training['devices'])}")
     for key, whose in (("labels", ""), ("labels_before", ", of its first weights")):
         for name, digest in (training.get(key) or {}).items():
             out.append(f"    label volume {name} {digest[:12]}{whose}")
-    for kind, scores in training.get("validation", {}).items():
+    for kind, scores in _by_kind(training.get("validation", {})).items():
         shown = ", ".join(f"{key} {value:.3f}" for key, value in scores.items())
         out.append(f"  {kind}, generated and held out: {shown}")
     out.append(f"  licence: {spec.get('license', 'unknown')}")
     out.append("  Research use only. Not a medical device.")
     return out
+
+
+def _trained(training: Mapping[str, Any]) -> str:
+    seed = training.get("seed", training.get("options", {}).get("seed", "?"))
+    return f"{training.get('data', 'unknown')}; seed {seed}, {training.get('step', '?')} steps"
+
+
+def _by_kind(validation: Mapping[str, Any]) -> Mapping[str, Mapping[str, float]]:
+    """Scores by the kind of scene; those of the segmenter have one kind alone."""
+    plain = all(isinstance(score, float) for score in validation.values())
+    return {"pictures": validation} if validation and plain else validation
 
 
 def _range(value: Any) -> str:

@@ -398,6 +398,17 @@ def test_info_prints_the_card_of_a_model(kind, tmp_path):
     assert altered.code == 5 and "was altered" in altered.err
 
 
+def test_info_prints_the_card_of_the_segmenter():
+    from gcar_deploy.imaging.net import KIND
+
+    done = gcar("info", KIND.path)
+    assert done.code == 0 and "segmenter: segmenter (which pixels are vessel" in done.out
+    spec = json.loads(KIND.path.with_suffix(".json").read_text())
+    dice = f"dice {spec['training']['validation']['dice']:.3f}"
+    assert spec["sha256"] in done.out and dice in done.out
+    assert "devices: trained on gcar_export.scenes.device_pictures" in done.out
+
+
 def test_the_end_of_a_process_collects_nothing():
     """What is frozen by then is not searched for cycles, which takes 0.1 s after a run."""
     code = (

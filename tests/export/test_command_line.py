@@ -5,6 +5,7 @@ import re
 import pytest
 from click.testing import CliRunner
 
+from gcar_deploy.imaging.net import KIND
 from gcar_export.cli.main import main
 
 
@@ -94,3 +95,10 @@ def test_what_the_system_refuses_is_one_line_with_its_file(tmp_path, monkeypatch
     monkeypatch.setattr("gcar_export.training.train.start", full)
     code, output = said("train", "--out", tmp_path / "a")
     assert (code, output) == (1, "gcar-export: error: runs/a/log.csv: No space left on device\n")
+
+
+def test_a_segmenter_is_verified_like_a_predictor():
+    code, output = said("verify", KIND.path, "--scenes", "2")
+    assert code == 0 and "golden case: largest difference" in output
+    dice = float(re.search(r"angiograms: Dice at 0\.5 (\S+) \(2 scenes\)", output)[1])
+    assert dice > 0.5

@@ -196,6 +196,7 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     channels = np.random.default_rng(0).normal(size=(3, 96, 112)).astype(np.float32)
     lines = _lines(np.random.default_rng(2))
     new = open_segmenter(out, threads=1)
+    assert new.session.check_golden() < 1e-6
     before, after = segmenter.look(channels), new.look(channels)
     np.testing.assert_array_equal(before.probability, after.probability)
     np.testing.assert_array_equal(before.chord, after.chord)
