@@ -34,7 +34,7 @@ from gcar_export.training.loop import Lesson, learn
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.run_folder import RunFolder
 from gcar_export.training.segmenter import changes, real_pictures
-from gcar_export.training.segmenter_start import devices_of, vessels_sha256
+from gcar_export.training.segmenter_start import devices_of, vessels_sha256, with_that_of
 
 #: pictures of this seed are for choosing, never for training
 VALIDATION_SEED = 90_003
@@ -191,6 +191,8 @@ def train(
     pictures = Pictures(options, pool or out / "pool", KIND.path, real)
     net = LineNet(LineNetConfig()).train()
     first = None if begin_from is None else devices_of(net, begin_from)
+    data = "gcar_export.scenes.device_pictures"
+    data += "; real ones with expert masks tell what is vessel" if options.real else ""
     folder = RunFolder(
         out,
         {
@@ -200,8 +202,7 @@ def train(
             "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
             "segmenter": pictures.sha256,
             "warm_start": first,
-            "data": "gcar_export.scenes.device_pictures"
-            + ("; real ones with expert masks tell what is vessel" if options.real else ""),
+            "data": with_that_of(begin_from, data, devices=True),
             "validation_seed": VALIDATION_SEED,
         },
     )

@@ -33,7 +33,7 @@ from gcar_export.training.loop import Lesson, Schedule, learn_together
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.run_folder import RunFolder, check_device
 from gcar_export.training.scene_stream import leave_interrupts_to_the_parent
-from gcar_export.training.segmenter_start import begin_with
+from gcar_export.training.segmenter_start import begin_with, with_that_of
 
 #: pictures with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -318,7 +318,7 @@ def train(
         )
         own = dataclasses.replace(options, fold=fold)
         where = out if fold == options.fold else out / f"fold-{fold[0]}-of-{fold[1]}"
-        pupils.append((RunFolder(where, _manifest(net, own, started)), net, lesson))
+        pupils.append((RunFolder(where, _manifest(net, own, started, begin_from)), net, lesson))
     learn_together(pupils, options, minutes)
 
 
@@ -339,15 +339,18 @@ def left_out_by(options: SegmenterOptions, count: int) -> list[tuple[tuple[int, 
     ]
 
 
-def _manifest(net: MaskUNet, options: SegmenterOptions, started: str | None) -> dict[str, Any]:
+def _manifest(
+    net: MaskUNet, options: SegmenterOptions, started: str | None, first: Path | None
+) -> dict[str, Any]:
+    data = "generated angiograms: gcar_export.scenes.picture_pool"
+    data += "; crops of real ones with expert masks" if options.real else ""
     return {
         "network": "mask-unet",
         "config": dataclasses.asdict(net.config),
         "seed": options.seed,
         "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
         "warm_start": started,
-        "data": "generated angiograms: gcar_export.scenes.picture_pool"
-        + ("; crops of real ones with expert masks" if options.real else ""),
+        "data": with_that_of(first, data),
         "validation_seed": VALIDATION_SEED,
     }
 
