@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from gcar_deploy.beside import started
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import RefusedError, UsageError
@@ -173,7 +175,8 @@ def _reconstructed(
         losses=refined.losses, predictor=centers.points.source, refiner=refined.refiner,
         model=None if predictor is None else predictor.model.label,
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
-        notes=_marks(options, len(missed), len(idle)), options=options, ending=refined.ending,
+        notes=(*_marks(options, len(missed), len(idle)), *_outside(tree, grid)),
+        options=options, ending=refined.ending,
         close_calls=refined.close_calls,
     )  # fmt: skip
 
@@ -190,6 +193,18 @@ def _marks(options: RunOptions, missed: int, idle: int) -> tuple[str, ...]:
         "inlets of an artery": len(options.ostia) - idle,
     }
     return tuple(f"of the user: {what} ({n})" for what, n in counts.items() if n)
+
+
+def _outside(tree: Tree, grid: Grid) -> tuple[str, ...]:
+    """Say how much of the tree the volume does not hold."""
+    length = 0.0
+    for branch in tree.branches:
+        index = grid.world2index(0.5 * (branch.points_mm[1:] + branch.points_mm[:-1]))
+        out = ((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any(axis=1)
+        length += float(np.diff(branch.arc_mm)[out].sum())
+    if length < 1.0:
+        return ()
+    return (f"{length:.0f} mm of the tree lie outside the volume: a larger one can be asked for",)
 
 
 def _nothing(step: Step) -> None:

@@ -23,11 +23,13 @@ class Grid:
     center_mm : (3,) middle of the block, mm LPS
     size_mm : (3,) full edge lengths, mm
     shape : (3,) number of voxels along x, y, z
+    bounds : whether vessels are looked for in it alone; otherwise wherever all views look
     """
 
     center_mm: tuple[float, float, float]
     size_mm: tuple[float, float, float]
     shape: tuple[int, int, int]
+    bounds: bool = True
 
     def __post_init__(self) -> None:
         if any(not math.isfinite(c) or abs(c) > 2000 for c in self.center_mm):

@@ -113,7 +113,10 @@ class Scene:
 
 
 def default_grid(carms: list[CArm]) -> Grid:
-    """Cube of 128^3 voxels round the isocentre whose middle sphere every view sees whole."""
+    """Cube of 128^3 voxels round the isocentre whose middle sphere every view sees whole.
+
+    It bounds the volume alone: vessels that all views see beside it are vessels (``common_field``).
+    """
     radius = DEFAULT_EDGE_MM / 2
     for carm in carms:
         c0, r0 = carm.principal_point
@@ -127,7 +130,9 @@ def default_grid(carms: list[CArm]) -> Grid:
         # The cone's edge touches a sphere of SOD sin(half angle) round the isocentre.
         radius = min(radius, carm.sod_mm * math.sin(math.atan(half)))
     edge = 2 * radius
-    return Grid(center_mm=(0.0, 0.0, 0.0), size_mm=(edge,) * 3, shape=(DEFAULT_SHAPE,) * 3)
+    return Grid(
+        center_mm=(0.0, 0.0, 0.0), size_mm=(edge,) * 3, shape=(DEFAULT_SHAPE,) * 3, bounds=False
+    )
 
 
 def load_scene(path: str | Path) -> Scene:

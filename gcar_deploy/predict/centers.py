@@ -5,9 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import cv2
+import numpy as np
+
 from gcar_deploy.config import CandidateOptions, RunOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.common_field import common_field
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import sampled_path
@@ -25,6 +29,10 @@ from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Image
 
+#: of a picture's lines so many mm must be without any point in the grid, and get one beside it
+BESIDE_MM = 4.0
+#: a point is on a line within so many cells
+COVERED_CELLS = 1.5
 _THINNED = "no model was used: depth was decided by thinning the visual hull"
 _ALONE = "depth was guessed by a model that sees one view at a time: it is off by a centimetre"
 _STRANGE = "no view has a direction that the model was trained on"
@@ -90,18 +98,60 @@ def seen_by_all(
 ) -> Seen:
     """Find the points of a lattice over ``grid`` that all views see as vessel.
 
-    The lattice is as fine as the vessels want it and the predictor knows it (``resolution``).
+    Where nobody asked for that grid and it leaves lines of a picture without any point, which
+    points beside it explain, the lattice is over all that every view sees: not always, since most
+    of what lies out there is ghosts. The lattice is as fine as the vessels want it and the
+    predictor knows it (``resolution``).
     """
     spec = predictor.model.spec if isinstance(predictor, CenterPredictor) else None
-    wanted: Resolution | None = resolution(views, grid, options, spec)
-    while wanted is not None:
-        chosen = dataclasses.replace(options.candidates, min_path_cells=wanted.min_path_cells)
-        paths = [sampled_path(view, wanted.cell_mm) for view in views]
-        hull = visual_hull(paths, cubic_lattice(grid, wanted.cell_mm), chosen)
-        wanted = wanted.coarser(len(hull))
-    hull = without_ghosts(hull, views, options.same_branch)
-    sampled = tuple((*p, view.calibrated) for p, view in zip(paths, views, strict=True))
-    return Seen(tuple(views), sampled, hull, encode(hull, sampled), chosen)
+    wanted = resolution(views, grid, options, spec)
+    found = _hull_in(grid, views, wanted, options.candidates)
+    left = [] if grid.bounds else [uncovered_mm(view, found.hull) for view in views]
+    if max(left, default=0.0) > BESIDE_MM:
+        space = common_field(grid, [view.carm for view in views])
+        wider = _hull_in(space, views, wanted, options.candidates)
+        now = (uncovered_mm(view, wider.hull) for view in views)
+        if max(a - b for a, b in zip(left, now, strict=True)) > BESIDE_MM:
+            found = wider
+    hull = without_ghosts(found.hull, views, options.same_branch)
+    sampled = tuple((*p, v.calibrated) for p, v in zip(found.paths, views, strict=True))
+    return Seen(tuple(views), sampled, hull, encode(hull, sampled), found.candidates)
+
+
+def uncovered_mm(view: VesselImage, hull: Candidates) -> float:
+    """Length of a picture's lines on which no candidate falls, mm at the isocentre."""
+    rows, columns = view.mask.shape
+    pixels = np.rint(view.carm.project(hull.points_mm)[0])
+    inside = ((pixels >= 0) & (pixels < (columns, rows))).all(axis=1)
+    column, row = pixels[inside].astype(np.int64).T
+    near = np.zeros((rows, columns), np.uint8)
+    near[row, column] = 1
+    pixel = view.carm.pixel_at_isocenter_mm
+    reach = 2 * round(COVERED_CELLS * float(hull.lattice.spacing_mm[0]) / pixel) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    return float(np.count_nonzero(view.skeleton & (cv2.dilate(near, disc) == 0))) * pixel
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Found:
+    """A hull, the pictures as finely as its lattice, and what makes a point one of it."""
+
+    hull: Candidates
+    paths: list[tuple[CArm, Image]]
+    candidates: CandidateOptions
+
+
+def _hull_in(
+    space: Grid, views: Sequence[VesselImage], wanted: Resolution, options: CandidateOptions
+) -> _Found:
+    """Find the hull in a space, in coarser cells where it would have too many points."""
+    finer: Resolution | None = wanted
+    while finer is not None:
+        chosen = dataclasses.replace(options, min_path_cells=finer.min_path_cells)
+        paths = [sampled_path(view, finer.cell_mm) for view in views]
+        hull = visual_hull(paths, cubic_lattice(space, finer.cell_mm), chosen)
+        finer = finer.coarser(len(hull))
+    return _Found(hull, paths, chosen)
 
 
 def find_centers(
