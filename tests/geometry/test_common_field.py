@@ -86,3 +86,6 @@ def test_vessel_beside_the_default_volume_is_a_candidate():
     # What points in the cube explain is not looked for beside it: there are ghosts out there.
     views = [dataclasses.replace(view, skeleton=np.zeros_like(view.skeleton)) for view in views]
     assert not reached(grid)
+    # Nor what no point anywhere explains.
+    views[0].skeleton[5:60, 9] = True
+    assert not reached(grid)
