@@ -121,6 +121,8 @@ class VesselImage:
     path_error : float
         Relative standard deviation of a path; 0 only for ``path_length`` pictures, whose scale
         was given: these are ``calibrated``.
+    noise_mm : float
+        Deviation of the noise of a ``path_length`` picture's pixel; 0 where it does not matter.
     others : tuple of VesselImage
         What each method alone sees, where this is a fusion of several.
     mask, skeleton, valid : (rows, cols) bool
@@ -159,6 +161,7 @@ class VesselImage:
     device: Image | None = None
     by_network: bool = False
     painted: Mask | None = None
+    noise_mm: float = 0.0
     others: tuple[VesselImage, ...] = ()
     kept: Callable[[], VesselImage] | None = None
 

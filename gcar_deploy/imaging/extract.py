@@ -204,9 +204,8 @@ def _from_path_length(angiogram: Angiogram) -> VesselImage:
     path = np.asarray(angiogram.pixels * np.float32(scale), dtype=np.float32)
     smallest = PATH_THRESHOLD_PIXELS * angiogram.carm.pixel_at_isocenter_mm
     valid = np.ones(path.shape, bool) if angiogram.valid is None else angiogram.valid
-    mask = vessels_in_noise(path, valid, angiogram.carm.pixel_at_isocenter_mm, smallest)
-    if mask is None:
-        mask = (path > smallest) & valid
+    found = vessels_in_noise(path, valid, angiogram.carm.pixel_at_isocenter_mm, smallest)
+    mask, noise = found or ((path > smallest) & valid, 0.0)
     if angiogram.mask is not None:
         mask &= angiogram.mask
     if not mask.any():
@@ -218,6 +217,7 @@ def _from_path_length(angiogram: Angiogram) -> VesselImage:
         carm=angiogram.carm,
         path_mm=np.where(mask, path, np.float32(0)),
         path_error=0.0,
+        noise_mm=noise,
         mask=mask,
         skeleton=skel.skeletonize(mask),
         valid=valid,

@@ -34,7 +34,9 @@ ENOUGH = 100
 ONE_SIGMA = 0.8413
 
 
-def vessels_in_noise(path: Image, valid: Mask, pixel_mm: float, smallest: float) -> Mask | None:
+def vessels_in_noise(
+    path: Image, valid: Mask, pixel_mm: float, smallest: float
+) -> tuple[Mask, float] | None:
     """Find vessel in path lengths with noise.
 
     Parameters
@@ -46,10 +48,11 @@ def vessels_in_noise(path: Image, valid: Mask, pixel_mm: float, smallest: float)
 
     Returns
     -------
-    (rows, cols) bool, or None where the noise does not come near ``smallest``
+    (rows, cols) bool and the noise's deviation, mm, or None where it does not come near
+    ``smallest``
     """
-    _, deviation = _background(path, valid, pixel_mm)
-    if MATTERS * deviation <= smallest:
+    _, noise = _background(path, valid, pixel_mm)
+    if MATTERS * noise <= smallest:
         return None
     blur = BLUR_MM / pixel_mm
     seen = path
@@ -58,7 +61,7 @@ def vessels_in_noise(path: Image, valid: Mask, pixel_mm: float, smallest: float)
     middle, deviation = _background(seen, valid, pixel_mm)
     low, high = (middle + many * deviation for many in (LOW, HIGH))
     strong = (seen > max(high, smallest)) & valid
-    return skel.parts_touching((seen > max(low, smallest)) & valid, strong)
+    return skel.parts_touching((seen > max(low, smallest)) & valid, strong), noise
 
 
 def _background(picture: Image, valid: Mask, pixel_mm: float) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import numpy as np
 from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.types import Scalars
+from gcar_deploy.types import Array, Scalars
 
 #: a vessel is thin whose radius so large a share of the lines does not reach
 THIN_SHARE = 0.15
@@ -26,6 +26,8 @@ THIN_SHARE = 0.15
 CELLS_PER_RADIUS = 1.4
 #: a point is kept from this share of the thin vessels' own path on
 PATH_SHARE = 0.5
+#: paths are summed over so wide a square, mm; steps along a line are so long on average, pixels
+SECTION_MM, STEP_PX = 4.0, 1.13
 #: a hull with more points (some 10 s of prediction on one core) is laid on cells wider by
 #: ``COARSER``
 MOST_POINTS = 100_000
@@ -102,6 +104,9 @@ def _thin_radius_mm(views: Sequence[VesselImage]) -> float:
         # which lies a quarter off the axis.
         depth = cv2.distanceTransform(view.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.25
         radius = depth[view.skeleton].astype(np.float64) * pixel
+        if view.noise_mm:
+            # Noise widens a shadow, but leaves the sum of its paths.
+            radius = np.minimum(radius, _by_section(view)[view.skeleton])
         found.append(radius)
         weight.append(np.full(len(radius), pixel))
     radii, lengths = np.concatenate(found), np.concatenate(weight)
@@ -110,3 +115,15 @@ def _thin_radius_mm(views: Sequence[VesselImage]) -> float:
     order = np.argsort(radii, kind="stable")
     part = np.cumsum(lengths[order])
     return float(radii[order][np.searchsorted(part, THIN_SHARE * part[-1])])
+
+
+def _by_section(view: VesselImage) -> Array:
+    """(rows, cols) radius, mm, by the paths about each pixel: their sum is length times section."""
+    pixel = view.carm.pixel_at_isocenter_mm
+    box = (2 * round(0.5 * SECTION_MM / pixel) + 1,) * 2
+    mass, line = (
+        cv2.boxFilter(picture.astype(np.float32), -1, box, normalize=False)
+        for picture in (view.path_mm, view.skeleton)
+    )
+    section = mass * pixel / np.maximum(line * STEP_PX, 1.0)
+    return np.sqrt(section / np.pi)

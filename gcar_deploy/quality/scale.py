@@ -45,6 +45,8 @@ _MEAN = (0.925, 1.09)
 _REFUSED = 1.5
 #: thick vessels need so many times the section of thin ones to tell blur from scale
 _LEAST_RANGE = 2.0
+#: paths up to so many deviations of the noise are none: in their sum they would widen a shadow
+NOISE_SIGMAS = 3.0
 
 
 def check_scale(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
@@ -112,7 +114,11 @@ def scale_factor(tree: Tree, view: VesselImage) -> float | None:
     # One look at the picture for all profiles.
     sizes = np.cumsum([line.pixels.size // 2 for line in lines])
     paths = bilinear(view.path_mm, np.concatenate([line.pixels.reshape(-1, 2) for line in lines]))
-    found = [_sections(*each) for each in zip(lines, np.split(paths, sizes[:-1]), strict=True)]
+    least = NOISE_SIGMAS * view.noise_mm
+    found = [
+        _sections(line, path, least)
+        for line, path in zip(lines, np.split(paths, sizes[:-1]), strict=True)
+    ]
     told, shown = np.concatenate(found, axis=1)
     if len(told) < _LEAST_PROFILES:
         return None
@@ -181,9 +187,10 @@ def _profiles(tree: Tree, view: VesselImage) -> list[_Profiles]:
     return found
 
 
-def _sections(line: _Profiles, path_mm: Array) -> Array:
+def _sections(line: _Profiles, path_mm: Array, least_mm: float) -> Array:
     """(2, k) variance, mm^2, of each shadow that stands alone: by its integral, by its shape."""
-    area, variance, alone = _moments(path_mm.reshape(line.pixels.shape[:2]), line.x_px)
+    path = path_mm.reshape(line.pixels.shape[:2])
+    area, variance, alone = _moments(np.where(path > least_mm, path, 0.0), line.x_px)
     good = alone & (variance > _LEAST_VARIANCE * _BLUR_PX2)
     told = area * line.sine * line.size_mm / (4 * np.pi)
     shown = (variance - _BLUR_PX2) * line.size_mm**2

@@ -32,11 +32,13 @@ def noisy(kind: str, level: float) -> np.ndarray:
 def test_vessels_are_found_and_little_else(kind: str, level: float) -> None:
     found = vessels_in_noise(noisy(kind, level).astype(np.float32), ALL, PIXEL_MM, SMALLEST)
     assert found is not None
-    assert found[TRUTH > 1.0].mean() > 0.995
+    mask, noise = found
+    assert mask[TRUTH > 1.0].mean() > 0.995
     # what is added lies on the rim, within the blur
     rim = tube_paths(radius_mm=2.0) > 0
-    assert not found[~rim].any()
-    assert found.sum() < 1.35 * (TRUTH > 0).sum()
+    assert not mask[~rim].any()
+    assert mask.sum() < 1.35 * (TRUTH > 0).sum()
+    assert noise == pytest.approx(5.0 / np.sqrt(level) if kind == "quanta" else level, rel=0.1)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.004])
@@ -46,6 +48,7 @@ def test_without_noise_to_speak_of_nothing_changes(level: float) -> None:
     found = extract_vessels(
         angiogram(np.round(path / 0.001), "path_length", mm_per_count=0.001), ImagingOptions()
     )
+    assert found.noise_mm == 0.0
     np.testing.assert_array_equal(found.mask, np.round(path / 0.001) * np.float32(0.001) > SMALLEST)
 
 
@@ -58,13 +61,13 @@ def test_a_picture_full_of_vessels_without_noise_is_no_noise() -> None:
 def test_noise_alone_holds_no_vessel() -> None:
     noise = np.abs(np.random.default_rng(3).normal(0, 0.1, (256, 256))).astype(np.float32)
     found = vessels_in_noise(noise, ALL, PIXEL_MM, SMALLEST)
-    assert found is not None and found.mean() < 1e-3
+    assert found is not None and found[0].mean() < 1e-3
 
 
 def test_paths_within_keep_their_mean() -> None:
     counts = np.round(noisy("cut", 0.1) / 0.001)
     found = extract_vessels(angiogram(counts, "path_length", mm_per_count=0.001), ImagingOptions())
-    assert found.calibrated
+    assert found.calibrated and found.noise_mm == pytest.approx(0.1, rel=0.1)
     assert found.path_mm.sum() == pytest.approx(TRUTH.sum(), rel=0.05)
     assert found.skeleton.sum() == pytest.approx(
         extract_vessels(

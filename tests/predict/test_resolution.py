@@ -22,8 +22,11 @@ FINE = {"spacing_mm": [0.3, 1.5], "path_cells": [0.15, 0.5]}
 GRID = Grid(center_mm=(0, 0, 0), size_mm=(120, 120, 120), shape=(120, 120, 120))
 
 
-def views(radius_mm: float, pixel_mm: float = 0.15):
+def views(radius_mm: float, pixel_mm: float = 0.15, noise_mm: float = 0.0):
     paths = tube_paths(512, radius_mm, pixel_mm, 2)
+    if noise_mm:
+        noise = np.random.default_rng(7).normal(0, noise_mm, paths.shape)
+        paths = np.maximum(paths + noise, 0)
     picture = angiogram(
         np.round(paths * 1000), "path_length", mm_per_count=0.001, pixel_mm=pixel_mm
     )
@@ -50,6 +53,14 @@ def test_thin_vessels_get_cells_of_their_width(radius_mm: float) -> None:
     assert radius_mm < found.cell_mm < 2 * radius_mm
     # less than the mean path of the vessel on a pixel of that size: it is found
     assert 0.15 <= found.min_path_cells < np.pi * radius_mm**2 / found.cell_mm**2
+
+
+@pytest.mark.parametrize("radius_mm", [0.3, 0.4])
+def test_noise_that_widens_shadows_does_not_coarsen_the_cells(radius_mm: float) -> None:
+    clean, noisy = (views(radius_mm, noise_mm=level) for level in (0.0, 0.15))
+    assert noisy[0].mask.sum() > 1.4 * clean[0].mask.sum()
+    cells = [resolution(seen, GRID, OPTIONS, FINE).cell_mm for seen in (clean, noisy)]
+    assert cells[1] == pytest.approx(cells[0], rel=0.2)
 
 
 def test_where_only_coarser_cells_are_known_the_threshold_falls() -> None:

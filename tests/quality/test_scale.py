@@ -11,6 +11,7 @@ import pytest
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.quality.human_range import check_human_range
 from gcar_deploy.quality.scale import check_scale, scale_factor
@@ -66,9 +67,10 @@ def test_the_factor_of_a_round_tube_is_found(radius, factor):
     assert found == pytest.approx(factor, rel=0.06)
 
 
-def two_tubes(factor, blur_px):
+def two_tubes(factor, blur_px, radii=(0.8, 2.4)):
     """A thin and a thick tube side by side, their paths scaled and blurred."""
-    thin, thick = tube((0, 0.2, 1), 0.8, middle=(-20, 0, 0)), tube((0, 0.2, 1), 2.4)
+    thin = tube((0, 0.2, 1), radii[0], middle=(-20, 0, 0))
+    thick = tube((0, 0.2, 1), radii[1])
     both = [picture(one, factor=factor).path_mm for one in (thin, thick)]
     path = sum(both)
     if blur_px:
@@ -86,6 +88,25 @@ def test_blur_is_no_wrong_scale_and_does_not_hide_one(blur_px):
     assert scale_factor(*two_tubes(1.8, 0)) == pytest.approx(1.8, rel=0.06)
     tree, view = two_tubes(0.5, blur_px)
     assert "mm_per_count" in check_scale(tree, [view])[0]
+
+
+def test_noise_is_no_wrong_scale_and_does_not_hide_one():
+    def noisy(factor):
+        tree, view = two_tubes(factor, 1.0, radii=(0.6, 1.3))
+        noise = np.random.default_rng(2).normal(0, 0.25, view.path_mm.shape)
+        path = np.maximum(view.path_mm + noise, 0).astype(np.float32)
+        mask, level = vessels_in_noise(path, view.valid, view.carm.pixel_at_isocenter_mm, 0.03)
+        path = np.where(mask, path, np.float32(0))
+        return tree, dataclasses.replace(view, path_mm=path, mask=mask, noise_mm=level)
+
+    tree, view = noisy(1.0)
+    assert check_scale(tree, [view, view]) == []
+    # Taken for vessel, noise beside it makes its shadow look too wide for its paths.
+    taken = dataclasses.replace(view, noise_mm=0.0)
+    assert "of all views are 0.9" in check_scale(tree, [taken, taken])[0]
+    tree, view = noisy(1.4)
+    assert scale_factor(tree, view) == pytest.approx(1.4, rel=0.05)
+    assert "mm_per_count" in check_scale(tree, [view, view])[0]
 
 
 def test_short_paths_of_one_calibre_may_be_blur():
