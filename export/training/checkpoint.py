@@ -48,7 +48,7 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         tensors = load(read_bounded(path, MAX_BYTES))
     except (ValueError, KeyError, OverflowError, MemoryError, SafetensorError, RuntimeError) as e:
-        raise ModelError(f"checkpoint {path} cannot be read: {_line(e)}") from None
+        raise ModelError(f"checkpoint {path.name} cannot be read: {_line(e)}") from None
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor.float()).all()):
             raise ModelError(f"checkpoint {path.name}: {name[:60]!r} holds values not finite")
