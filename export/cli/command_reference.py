@@ -89,8 +89,22 @@ def _kind(option: click.Parameter) -> str:
         return ""
     if isinstance(option.type, click.Choice):
         return " " + " / ".join(f"`{choice}`" for choice in option.type.choices)
+    if isinstance(option.type, (click.IntRange, click.FloatRange)):
+        return f" {_range(option.type)}"
     metavar = option.metavar or option.type.name.upper()
     return f" {metavar}".replace("|", "\\|")
+
+
+def _range(kind: click.IntRange | click.FloatRange) -> str:
+    """Name a number by its kind and what is taken."""
+    name = "INTEGER" if isinstance(kind, click.IntRange) else "FLOAT"
+    if kind.min is None and kind.max is None:
+        return name
+    if kind.max is None:
+        return f"{name} {'above' if kind.min_open else 'from'} {kind.min}"
+    if kind.min is None:
+        return f"{name} up to {kind.max}"
+    return f"{name} {kind.min} .. {kind.max}"
 
 
 def main(arguments: list[str]) -> int:
