@@ -104,14 +104,14 @@ def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
     """Put on the desk what the command names; return the case's name, or the key of a result."""
     from gcar_deploy.errors import ImageError
     from gcar_deploy.workbench.case import ORDER_NAME
-    from gcar_deploy.workbench.desk import absolute
+    from gcar_deploy.workbench.desk import absolute, case_folder
 
     views = order.views
     if not views:
         return None, None
     if len(views) == 1 and views[0].is_dir():
         folder = views[0]
-        if any((place / ORDER_NAME).is_file() for place in (folder, folder.resolve().parent)):
+        if (case_folder(folder) / ORDER_NAME).is_file():
             return str(desk.again(folder).id), None
         if (folder / "report.html").is_file():
             return None, str(desk.shelve(folder))

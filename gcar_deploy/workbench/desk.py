@@ -85,9 +85,7 @@ class Desk:
         UsageError
             There is no order in it.
         """
-        folder = folder.resolve()
-        if folder.name == RESULT_NAME and not (folder / ORDER_NAME).exists():
-            folder = folder.parent
+        folder = case_folder(folder)
         order = load_order(folder / ORDER_NAME).with_files(
             lambda _, path: path.relative_to(folder) if folder in path.parents else path
         )
@@ -127,6 +125,13 @@ class Desk:
         case.say_refused(None)
         case.result = result
         return result.summary(), folder
+
+
+def case_folder(folder: Path) -> Path:
+    """Return the folder of a case: the one given, or that of which it is the result."""
+    folder = folder.resolve()
+    is_result = folder.name == RESULT_NAME and not (folder / ORDER_NAME).exists()
+    return folder.parent if is_result else folder
 
 
 def absolute(order: Order) -> Order:

@@ -33,6 +33,17 @@ def test_a_folder_of_pictures_is_a_case_in_the_order_of_their_numbers(desk, tmp_
     assert [path.name for path in opened.order.views] == ["view9.png", "view10.png"]
 
 
+def test_a_result_is_its_case_and_another_beside_it_is_a_report(desk, tmp_path):
+    case = desk.demo()
+    for name in ("result", "kept"):
+        (case.folder / name).mkdir()
+        (case.folder / name / "report.html").write_text("a page")
+    other = Desk(tmp_path / "others")
+    assert _first(other, Order(views=(case.folder / "result",))) == (case.id, None)
+    name, shelved = _first(other, Order(views=(case.folder / "kept",)))
+    assert name is None and other.file(shelved, "report.html")[0] == case.folder / "kept"
+
+
 def test_what_is_no_case_is_said(desk, tmp_path):
     with pytest.raises(ImageError, match="nowhere: no such file or folder"):
         _first(desk, Order(views=(tmp_path / "nowhere",)))
