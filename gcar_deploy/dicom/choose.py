@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
 from typing import Protocol
 
 import cv2
@@ -15,7 +14,7 @@ from gcar_deploy.dicom.header import Header
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import DEFAULT_FIELD_MM
-from gcar_deploy.imaging.enhance import darkness
+from gcar_deploy.imaging.polarity import is_dark_run
 from gcar_deploy.types import Array, Image, Scalars
 
 #: frames filled to this share of the best are compared by their stillness
@@ -24,9 +23,6 @@ _FILLED_SHARE = 0.9
 _LEAST_FILLED_SHARE = 0.5
 #: frames are compared at this size, pixels along the longer side
 _SIDE = 192
-#: so many frames are asked whether vessels are dark; what they say counts where the ridges of one
-#: sign are 1.5 times as strong, as in ``imaging.polarity``
-_ASKED, _SURE = 6, math.log(1.5)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -142,7 +138,8 @@ def filling_and_motion(
     all of them alike. Motion is the mean change to the neighbours.
     """
     small = [_small(frames.decode(k)) for k in range(len(frames))]
-    if not _is_dark(small, intensity or Intensity(kind="raw")):
+    pixel_mm = DEFAULT_FIELD_MM / max(small[0].shape)
+    if not is_dark_run(small, pixel_mm, intensity or Intensity(kind="raw")):
         # About the middle of all counts that there are, as MONOCHROME1 is.
         top = 2.0 ** math.ceil(math.log2(max(float(p.max()) for p in small) + 1.0)) - 1.0
         small = [top - p for p in small]
@@ -161,16 +158,6 @@ def _small(picture: Array) -> Array:
     scale = min(1.0, _SIDE / max(picture.shape))
     size = (max(8, round(picture.shape[1] * scale)), max(8, round(picture.shape[0] * scale)))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
-
-
-def _is_dark(small: Sequence[Array], intensity: Intensity) -> bool:
-    """Whether vessels are dark: declared, else by the frame that tells most, else as usual."""
-    if intensity.polarity != "auto":
-        return intensity.polarity == "dark"
-    pixel_mm = DEFAULT_FIELD_MM / max(small[0].shape)
-    some = small[:: max(1, len(small) // _ASKED)]
-    said = max((darkness(one, pixel_mm) for one in some), key=abs)
-    return said > (-_SURE if intensity.kind == "raw" else _SURE)
 
 
 def _level(small: Array) -> Array:

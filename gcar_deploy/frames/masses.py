@@ -20,10 +20,9 @@ from gcar_deploy.geometry.consistency import BIN_MM, HALF_BINS
 from gcar_deploy.geometry.epipolar import plane_axes, reach_mm, slices_along
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging import enhance
-from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.collimator import collimator
 from gcar_deploy.imaging.extract import above_half
-from gcar_deploy.imaging.polarity import is_dark
+from gcar_deploy.imaging.polarity import is_dark_run
 from gcar_deploy.types import Array, Image, Mask
 
 #: longer side of the pictures that are compared, pixels
@@ -37,8 +36,6 @@ _NOISE, _LEAST_SHARE = 3.0, 0.25
 #: of what is narrow in a frame so much is left at least where anything moves, and so much of it
 #: stands elsewhere in the next frame
 _LEAST_LEFT, _LEAST_MOTION = 0.35, 0.1
-#: so many frames are asked whether vessels are dark
-_ASKED = 6
 #: smoothing of the profiles, mm at the isocentre
 _SIGMA_MM = 1.0
 
@@ -163,16 +160,9 @@ def _contrast(
 
 def _bright(stack: Array, carm: CArm, intensity: Intensity) -> tuple[Array, Mask]:
     """Frames with bright vessels in which paths about add up, and where nothing is shown."""
-    told, mm = stack[0], carm.pixel_at_isocenter_mm
-    if intensity.polarity == "auto":
-        # A frame without contrast tells nothing of how vessels look: the one that tells most does.
-        some = stack[:: max(1, len(stack) // _ASKED)]
-        told = max(some, key=lambda one: abs(enhance.darkness(one, mm)))
-    dark = is_dark(
-        Angiogram(view_id="", carm=carm, pixels=told, bit_depth=8, intensity=intensity, sha256="")
-    )
+    dark = is_dark_run(stack, carm.pixel_at_isocenter_mm, intensity)
     if intensity.kind == "attenuation":
-        return -stack if dark else stack.copy(), np.zeros(told.shape, bool)
+        return -stack if dark else stack.copy(), np.zeros(stack.shape[1:], bool)
     holes = collimator(np.median(stack, axis=0).astype(np.float32), negative=not dark)
     # One white level for the whole run: what its display does to one frame it does to all.
     level = np.asarray(stack if dark else stack.max() - stack, dtype=np.float32)

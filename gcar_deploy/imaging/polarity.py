@@ -7,10 +7,15 @@ import functools
 import logging
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from gcar_deploy.beside import side_by_side
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.types import Array, Image
+
+if TYPE_CHECKING:  # only a name in annotations: pictures need no scene file
+    from gcar_deploy.geometry.scene import Intensity
 
 _log = logging.getLogger(__name__)
 #: polarity is taken from pictures only where one sign shows so many times as much. Of dark ones
@@ -19,6 +24,8 @@ _log = logging.getLogger(__name__)
 _MARGIN = 1.5
 #: ... and from a single picture against the others where it shows so many times as much
 _SURE = 3.0
+#: so many frames of a run are asked
+_ASKED = 6
 
 
 def with_polarity(angiograms: Sequence[Angiogram]) -> list[Angiogram]:
@@ -46,6 +53,19 @@ def is_dark(angiogram: Angiogram) -> bool:
     return _are_dark([angiogram])[0]
 
 
+def is_dark_run(frames: Sequence[Image] | Array, pixel_mm: float, intensity: Intensity) -> bool:
+    """``is_dark`` of a run, by the frame that tells most: one without contrast tells nothing."""
+    if intensity.polarity != "auto":
+        return intensity.polarity == "dark"
+    some = frames[:: max(1, len(frames) // _ASKED)]
+    said = max((enhance.darkness(one, pixel_mm) for one in some), key=abs)
+    return said > 0 if _decides(said) else intensity.kind == "raw"
+
+
+def _decides(said: float) -> bool:
+    return abs(said) >= math.log(_MARGIN)
+
+
 def _are_dark(angiograms: Sequence[Angiogram]) -> list[bool]:
     """Say it of pictures of one kind: what one shows for sure, else what all show together."""
     works = [
@@ -57,7 +77,7 @@ def _are_dark(angiograms: Sequence[Angiogram]) -> list[bool]:
     out = []
     for one, own in zip(angiograms, seen, strict=True):
         said = own if abs(own) >= math.log(_SURE) else together
-        decided = abs(said) >= math.log(_MARGIN)
+        decided = _decides(said)
         dark = said > 0 if decided else one.intensity.kind == "raw"
         why = "seen" if decided else f"usual for {one.intensity.kind}"
         _log.info(
