@@ -11,6 +11,7 @@ import hashlib
 import logging
 import math
 import warnings
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,11 @@ class Header:
         own = self.dataset.get("PerFrameFunctionalGroupsSequence") or []
         shared = self.dataset.get("SharedFunctionalGroupsSequence") or []
         return [*([own[frame]] if frame < len(own) else []), *shared[:1]]
+
+
+def told_apart(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
+    """Keywords of which both tell, and tell otherwise."""
+    return [key for key in one if one[key] and other[key] and one[key] != other[key]]
 
 
 def tag(keyword: str) -> str:

@@ -14,7 +14,7 @@ from gcar_deploy.config import DicomOptions
 from gcar_deploy.dicom.carm import frame_carm, is_flipped
 from gcar_deploy.dicom.choose import Choice, choose_frame
 from gcar_deploy.dicom.frames import Frames
-from gcar_deploy.dicom.header import PATIENT, SYNTAXES, Header, read_header, tag
+from gcar_deploy.dicom.header import PATIENT, SYNTAXES, Header, read_header, tag, told_apart
 from gcar_deploy.dicom.shutter import open_field
 from gcar_deploy.errors import GeometryError, RefusedError, UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, parse_scene, scene_to_json
@@ -153,7 +153,7 @@ def check_origin(headers: Mapping[int, Header]) -> list[str]:
         one, other = (
             {key: _text(headers[k], key) for key in (*PATIENT, "StudyInstanceUID")} for k in (a, b)
         )
-        differ = [key for key in one if one[key] and other[key] and one[key] != other[key]]
+        differ = told_apart(one, other)
         patient = [key for key in differ if key in PATIENT]
         if patient:
             raise RefusedError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from pydicom.uid import (
 )
 from pydicom.valuerep import DA, TM, PersonName
 
-from gcar_deploy.dicom.header import PATIENT
+from gcar_deploy.dicom.header import PATIENT, told_apart
 from gcar_deploy.errors import GcarError, ImageError, UsageError
 from gcar_deploy.output.dicom_sr import measurement_report
 from gcar_deploy.output.dicom_stl import dicom_stl, equipment
@@ -81,8 +82,9 @@ def _objects(folder: Path, runs: Sequence[Path], pdf: Path | None) -> dict[str, 
     headers = [_header(run, stored.summary) for run in runs]
     if len(headers) != len(stored.summary["views"]):
         raise UsageError(f"{len(headers)} runs: the result has {len(stored.summary['views'])}")
-    for keyword in PATIENT:
-        if len({str(header[keyword].value).strip().upper() for header in headers} - {""}) > 1:
+    whose = [{key: str(one[key].value).strip().upper() for key in PATIENT} for one in headers]
+    for one, other in itertools.combinations(whose, 2):
+        for keyword in told_apart(one, other):
             raise UsageError(
                 f"the runs tell of different patients ({keyword}): the result belongs to neither"
             )
