@@ -7,14 +7,13 @@ from pathlib import Path
 import click
 
 from gcar_export.cli.evaluate import words
-from gcar_export.cli.options import OUT_FOLDER
+from gcar_export.cli.options import FOLDER, OUT_FOLDER
 
-_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _CASES = click.option("--cases", default="", help="Only these cases, comma-separated.")
 
 
 @click.command("centers-table")
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
 @click.option(
     "--protocol",
     type=click.Choice(["paper", "clinical", "moved", "raw"]),
@@ -43,7 +42,7 @@ def centers_table(data: Path, protocol: str, models: str, cases: str, no_cost: b
 
 
 @click.command()
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
 @_CASES
 @click.option(
     "--curves",

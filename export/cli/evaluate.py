@@ -9,9 +9,8 @@ from typing import Any
 import click
 
 from gcar_deploy.errors import UsageError
-from gcar_export.cli.options import COUNT, OUT_FOLDER
+from gcar_export.cli.options import COUNT, FOLDER, OUT_FOLDER, counted
 
-_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _SET_UPS = ["paper", "clinical", "moved", "raw"]
 _PROTOCOL = click.option(
     "--protocol", type=click.Choice(_SET_UPS), default="paper", show_default=True
@@ -59,7 +58,7 @@ def _list_methods(ctx: click.Context, _: click.Parameter, methods: str) -> str:
 
 
 @click.command()
-@click.option("--data", type=_FOLDER, help="Folder with imagecas/, asoca/ or masks; not for thin.")
+@click.option("--data", type=FOLDER, help="Folder with imagecas/, asoca/ or masks; not for thin.")
 @click.option(
     "--protocol",
     type=click.Choice([*_SET_UPS, "common", "thin"]),
@@ -78,7 +77,7 @@ def _list_methods(ctx: click.Context, _: click.Parameter, methods: str) -> str:
 )
 @click.option("--views", default="2", show_default=True, help="Comma-separated, 2 .. 16 each.")
 @click.option("--out", type=OUT_FOLDER, required=True, help="Rows, tables, pictures, report.")
-@click.option("--jobs", type=COUNT, default=1, show_default=True, help="Processes on this machine.")
+@counted("--jobs", 1, "Processes on this machine.")
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
 @_PAPER_STEPS
 @click.option(
@@ -167,14 +166,14 @@ def evaluate(
 
 
 @click.command()
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
 @_PROTOCOL
 @click.option("--methods", default="nerp,3dgr-fbp", show_default=True, help="Comma-separated.")
 @click.option("--steps", default="25,50,100,200,400", show_default=True, help="Budgets.")
 @click.option("--views", type=click.IntRange(2, 16), default=2, show_default=True)
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
 @click.option("--out", type=OUT_FOLDER, required=True, help="Rows, converge.csv, converge.png.")
-@click.option("--jobs", type=COUNT, default=1, show_default=True, help="Processes on this machine.")
+@counted("--jobs", 1, "Processes on this machine.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def converge(
     data: Path,
@@ -215,11 +214,11 @@ def converge(
 
 
 @click.command("paper-page")
-@click.option("--data", type=_FOLDER, required=True, help="Folder with imagecas/ and asoca/.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/ and asoca/.")
 @click.option("--out", type=OUT_FOLDER, required=True, help="Rows, paper.md, paper-views.png.")
 @click.option("--paper-steps", type=COUNT, help="Most iterations; the printed 8,000 without.")
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
-@click.option("--jobs", type=COUNT, default=1, show_default=True, help="Processes on this machine.")
+@counted("--jobs", 1, "Processes on this machine.")
 @click.option("--draw-only", is_flag=True, help="Run nothing; draw what is there.")
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def paper_page(

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import click
 
-from gcar_export.cli.options import COUNT, SEED
+from gcar_export.cli.options import SEED, counted
 
 
 @click.command("frame-pairs")
-@click.option(
-    "--patients",
-    type=COUNT,
-    default=10,
-    show_default=True,
-    help="Generated patients, two runs each.",
-)
-@click.option("--seed", type=SEED, default=7_300, show_default=True, help="Population of patients.")
+@counted("--patients", 10, "Generated patients, two runs each.")
+@counted("--seed", 7_300, "Population of patients.", SEED)
 def frame_pairs(patients: int, seed: int) -> None:
     """Choose frames of generated cine runs, and say how far off the heart's phase is.
 

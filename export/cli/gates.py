@@ -6,30 +6,23 @@ import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from gcar_export.cli.evaluate import words
-from gcar_export.cli.options import COUNT, OUT_FILE, OUT_FOLDER, SEED
+from gcar_export.cli.options import FOLDER, OUT_FILE, OUT_FOLDER, SEED, counted, taking
 
 if TYPE_CHECKING:
     from gcar_export.studies.gate_rows import Row
 
-_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 #: what all three commands ask: they read and add to the same rows
-_SHARED = (
-    click.option("--data", type=_FOLDER, help="Folder with label volumes: look at these as well."),
+_shared = taking(
+    click.option("--data", type=FOLDER, help="Folder with label volumes: look at these as well."),
     click.option("--cases", default="", help="Only these of them, comma-separated."),
     click.option("--out", type=OUT_FOLDER, required=True,
                  help="Rows, tables, pictures; may hold those of an earlier run."),
 )  # fmt: skip
-
-
-def _shared(command: Any) -> Any:
-    for option in reversed(_SHARED):
-        command = option(command)
-    return command
 
 
 def _measured(
@@ -65,15 +58,9 @@ def _say(parts: Sequence[str], file: Path) -> None:
 
 
 @click.command("gate-table")
-@click.option(
-    "--trees", type=COUNT, default=24, show_default=True, help="Generated trees per seed."
-)
-@click.option(
-    "--seed", type=SEED, default=50_001, show_default=True, help="Population to choose gates on."
-)
-@click.option(
-    "--check-seed", type=SEED, default=50_002, show_default=True, help="Population to check on."
-)
+@counted("--trees", 24, "Generated trees per seed.")
+@counted("--seed", 50_001, "Population to choose gates on.", SEED)
+@counted("--check-seed", 50_002, "Population to check on.", SEED)
 @_shared
 def gate_table(
     trees: int, seed: int, check_seed: int, data: Path | None, cases: str, out: Path
@@ -109,16 +96,10 @@ def gate_table(
 
 
 @click.command("ghost-fit")
-@click.option(
-    "--trees", type=COUNT, default=24, show_default=True, help="Generated trees to fit to."
-)
-@click.option("--seed", type=SEED, default=60_001, show_default=True, help="Population to fit to.")
-@click.option(
-    "--check-trees", type=COUNT, default=12, show_default=True, help="Other trees, to check on."
-)
-@click.option(
-    "--check-seed", type=SEED, default=60_002, show_default=True, help="Their population."
-)
+@counted("--trees", 24, "Generated trees to fit to.")
+@counted("--seed", 60_001, "Population to fit to.", SEED)
+@counted("--check-trees", 12, "Other trees, to check on.")
+@counted("--check-seed", 60_002, "Their population.", SEED)
 @click.option("--write", type=OUT_FILE,
               help="Write the model there (gcar_deploy/quality/ghosts.json).")  # fmt: skip
 @_shared
@@ -157,15 +138,9 @@ def ghost_fit(
 
 
 @click.command("status-table")
-@click.option(
-    "--trees", type=COUNT, default=12, show_default=True, help="Generated trees per seed."
-)
-@click.option(
-    "--seed", type=SEED, default=50_001, show_default=True, help="Population of the rule."
-)
-@click.option(
-    "--check-seed", type=SEED, default=50_002, show_default=True, help="Population to check on."
-)
+@counted("--trees", 12, "Generated trees per seed.")
+@counted("--seed", 50_001, "Population of the rule.", SEED)
+@counted("--check-seed", 50_002, "Population to check on.", SEED)
 @_shared
 def status_table(
     trees: int, seed: int, check_seed: int, data: Path | None, cases: str, out: Path

@@ -14,13 +14,10 @@ from gcar_export.cli.evaluate import converge, evaluate, paper_page
 from gcar_export.cli.frames import frame_pairs
 from gcar_export.cli.gates import gate_table, ghost_fit, status_table
 from gcar_export.cli.models import export, export_segmenter, golden, verify
-from gcar_export.cli.options import COUNT, DURATION, OUT_FILE, OUT_FOLDER
+from gcar_export.cli.options import DURATION, FILE, FOLDER, FROM_ZERO, OUT_FILE, OUT_FOLDER, counted
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table, speed_table
 from gcar_export.cli.training import train, train_devices, train_segmenter
 from gcar_export.cli.wrong_scenes import wrong_scenes
-
-_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
-_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
 class _Group(click.Group):
@@ -64,7 +61,7 @@ def main(verbose: bool) -> None:
 
 
 @main.command()
-@click.argument("case_dirs", nargs=-1, type=_FOLDER, required=True)
+@click.argument("case_dirs", nargs=-1, type=FOLDER, required=True)
 @click.option(
     "--run-option", "extra", multiple=True, help="Passed on to 'gcar run', one word each."
 )
@@ -91,7 +88,7 @@ def score(case_dirs: tuple[Path, ...], extra: tuple[str, ...], limit: float) -> 
 
 
 @main.command()
-@click.argument("label", type=_FILE)
+@click.argument("label", type=FILE)
 @click.argument("out", type=OUT_FOLDER)
 @click.option(
     "--protocol",
@@ -115,8 +112,8 @@ def simulate(label: Path, out: Path, protocol: str, views: int) -> None:
 
 
 @main.command("pair-time")
-@click.argument("label", type=_FILE)
-@click.option("--repeats", type=COUNT, default=7, show_default=True, help="Timings of each.")
+@click.argument("label", type=FILE)
+@counted("--repeats", 7, "Timings of each.")
 def pair_time(label: Path, repeats: int) -> None:
     """Time a warm reconstruction against one itk-rtk forward + back projection.
 
@@ -136,12 +133,8 @@ def pair_time(label: Path, repeats: int) -> None:
 
 
 @main.command("tree-table")
-@click.option(
-    "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
-)
-@click.option(
-    "--count", type=COUNT, default=30, show_default=True, help="Generated trees of each style."
-)
+@click.option("--data", type=FOLDER, help="Folder with imagecas/; left out: generated trees alone.")
+@counted("--count", 30, "Generated trees of each style.")
 def tree_table(data: Path | None, count: int) -> None:
     """Compare generated trees with real ones, figure by figure.
 
@@ -158,26 +151,10 @@ def tree_table(data: Path | None, count: int) -> None:
 
 
 @main.command("lumen-table")
-@click.option(
-    "--data", type=_FOLDER, help="Folder with imagecas/; left out: generated trees alone."
-)
-@click.option(
-    "--count", type=COUNT, default=30, show_default=True, help="Cases, one stenosis each."
-)
-@click.option(
-    "--vessels",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Single vessels of known area, of each kind of picture.",
-)
-@click.option(
-    "--healthy",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Generated trees without a lesion.",
-)
+@click.option("--data", type=FOLDER, help="Folder with imagecas/; left out: generated trees alone.")
+@counted("--count", 30, "Cases, one stenosis each.")
+@counted("--vessels", 0, "Single vessels of known area, of each kind of picture.", FROM_ZERO)
+@counted("--healthy", 0, "Generated trees without a lesion.", FROM_ZERO)
 def lumen_table(data: Path | None, count: int, vessels: int, healthy: int) -> None:
     """Measure stenosis, radius and branch lengths on trees with one known stenosis.
 
@@ -241,9 +218,9 @@ for _verb in (
 
 
 @main.command()
-@click.option("--data", type=_FOLDER, required=True, help="Folder with phantom_xa/.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with phantom_xa/.")
 @click.option("--out", type=OUT_FOLDER, required=True, help="New folder.")
-@click.option("--landmarks", type=_FILE, help="JSON of landmarks marked in the four views.")
+@click.option("--landmarks", type=FILE, help="JSON of landmarks marked in the four views.")
 def phantom(data: Path, out: Path, landmarks: Path | None) -> None:
     """Fit some real X-ray runs of a phantom, predict the others; tables and a page.
 
@@ -263,7 +240,7 @@ def phantom(data: Path, out: Path, landmarks: Path | None) -> None:
 
 
 @main.command("pose-table")
-@click.option("--trees", type=COUNT, default=3, show_default=True, help="Generated trees.")
+@counted("--trees", 3, "Generated trees.")
 @click.option("--out", type=OUT_FILE, required=True, help="Rows (JSON lines).")
 def pose_table(trees: int, out: Path) -> None:
     """Measure trees from a second view that is off, with and without pose refinement.

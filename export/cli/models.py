@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 
 from gcar_deploy.errors import UsageError
-from gcar_export.cli.options import COUNT, OUT_FILE
+from gcar_export.cli.options import FILE, OUT_FILE, counted
 
-_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _REPLACE = click.option("--force", is_flag=True, help="Replace a model that is there.")
 
 
@@ -26,9 +25,9 @@ def _check_free(out: Path, force: bool, int8: bool = False) -> None:
 
 
 @click.command()
-@click.argument("checkpoint", type=_FILE)
+@click.argument("checkpoint", type=FILE)
 @click.option("--out", type=OUT_FILE, required=True, help="The ONNX file.")
-@click.option("--inputs", type=COUNT, default=60, show_default=True, help="For the parity check.")
+@counted("--inputs", 60, "For the parity check.")
 @click.option("--int8", is_flag=True, help="Also try OUT-int8.onnx, kept if the task allows it.")
 @_REPLACE
 def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) -> None:
@@ -52,10 +51,8 @@ def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) ->
 
 
 @click.command()
-@click.argument("model", type=_FILE)
-@click.option(
-    "--scenes", type=COUNT, default=12, show_default=True, help="Generated scenes to run."
-)
+@click.argument("model", type=FILE)
+@counted("--scenes", 12, "Generated scenes to run.")
 def verify(model: Path, scenes: int) -> None:
     """Check a model file against its spec and run it through the runtime's own predictor.
 
@@ -67,7 +64,7 @@ def verify(model: Path, scenes: int) -> None:
 
 
 @click.command()
-@click.argument("model", type=_FILE)
+@click.argument("model", type=FILE)
 @click.option("--force", is_flag=True, help="Replace an existing golden case.")
 def golden(model: Path, force: bool) -> None:
     """Write MODEL's golden case: a small input, and what the model says to it today.
@@ -83,9 +80,9 @@ def golden(model: Path, force: bool) -> None:
 
 
 @click.command("export-segmenter")
-@click.argument("checkpoint", type=_FILE)
+@click.argument("checkpoint", type=FILE)
 @click.option("--out", type=OUT_FILE, required=True, help="The ONNX file.")
-@click.option("--devices", type=_FILE, help="Of train-devices, or a model that has one: goes in.")
+@click.option("--devices", type=FILE, help="Of train-devices, or a model that has one: goes in.")
 @_REPLACE
 def export_segmenter(checkpoint: Path, out: Path, devices: Path | None, force: bool) -> None:
     """Turn the segmentation network's CHECKPOINT into one ONNX file with its spec, and prove it.

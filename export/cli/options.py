@@ -1,4 +1,4 @@
-"""Types that options of several verbs share: counts, numbers, places to write to."""
+"""What options of several verbs share: counts, numbers, places to read and to write."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import click
 
 from gcar_deploy.errors import UsageError
 
-#: how many; a seed of numpy's generators
-COUNT, SEED = click.IntRange(1), click.IntRange(0)
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+#: how many: some, or none as well; a seed of numpy's generators
+COUNT, FROM_ZERO = click.IntRange(1), click.IntRange(0)
+SEED = FROM_ZERO
 
 
 class Number(click.FloatRange):
@@ -61,3 +64,19 @@ class Out(click.Path):
 
 
 OUT_FOLDER, OUT_FILE = Out(), Out(file=True)
+
+
+def counted(name: str, default: int, text: str, kind: click.IntRange = COUNT) -> Any:
+    """Declare an option that is a whole number, and shows its default."""
+    return click.option(name, type=kind, default=default, show_default=True, help=text)
+
+
+def taking(*options: Any) -> Any:
+    """Give a verb options that it shares with others, in this order."""
+
+    def taken(command: Any) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return taken

@@ -10,14 +10,11 @@ import click
 
 from gcar_deploy.errors import UsageError
 from gcar_export.cli.evaluate import words
-from gcar_export.cli.options import COUNT, OUT_FILE, OUT_FOLDER, SEED, Number
-
-_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
-_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+from gcar_export.cli.options import FILE, FOLDER, OUT_FILE, OUT_FOLDER, SEED, Number, counted
 
 
 @click.command("refine-table")
-@click.option("--data", type=_FOLDER, required=True, help="Folder with label volumes.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with label volumes.")
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
 @click.option("--noises", default="0,0.5,1,2", show_default=True, help="Start noise, voxels.")
@@ -67,7 +64,7 @@ def cost_curves() -> None:
 
 
 @click.command("speed-table")
-@click.argument("labels", type=_FILE, nargs=-1, required=True)
+@click.argument("labels", type=FILE, nargs=-1, required=True)
 @click.option("--protocol", default="paper", show_default=True, help="paper, clinical or raw.")
 @click.option("--rounds", type=click.IntRange(1, 100), default=3, show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON in place of the table.")
@@ -101,10 +98,8 @@ def speed_table(
 
 
 @click.command("sigma-table")
-@click.option(
-    "--seed", type=SEED, default=1, show_default=True, help="Population of generated trees."
-)
-@click.option("--trees", type=COUNT, default=10, show_default=True, help="Trees per row.")
+@counted("--seed", 1, "Population of generated trees.", SEED)
+@counted("--trees", 10, "Trees per row.")
 @click.option("--protocols", default="paper,clinical", show_default=True)
 @click.option("--pictures", default="clean,degraded,mask,raw", show_default=True)
 @click.option("--predictors", default="multi,none", show_default=True)
@@ -142,7 +137,7 @@ def sigma_table(
 
 
 @click.command("flow-table")
-@click.option("--count", type=COUNT, default=20, show_default=True, help="Generated trees.")
+@counted("--count", 20, "Generated trees.")
 @click.option(
     "--percent", type=Number(1, 99), default=60.0, show_default=True,
     help="Diameter stenosis of each.",

@@ -8,10 +8,32 @@ from typing import Any
 
 import click
 
-from gcar_export.cli.options import COUNT, DURATION, OUT_FOLDER, RATE, SEED, Number
+from gcar_export.cli.options import (
+    COUNT,
+    DURATION,
+    FILE,
+    FOLDER,
+    OUT_FOLDER,
+    RATE,
+    SEED,
+    Number,
+    taking,
+)
 
-_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+#: what the verbs ask that train on pictures
+_on_pictures = taking(
+    click.option("--out", type=OUT_FOLDER, required=True, help="Folder of the run."),
+    click.option("--steps", type=COUNT, help="Steps in all."),
+    click.option("--decay-steps", type=COUNT, help="Length of the final decay."),
+    click.option("--batch", type=COUNT, help="Pictures of a step."),
+    click.option("--learning-rate", type=RATE),
+    click.option("--seed", type=SEED, help="Of the pictures, and of what is cut from them."),
+    click.option("--real", type=FOLDER, help="Real angiograms to train on: N.png, N_gt.png."),
+    click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out."),
+    click.option("--pictures", type=COUNT, help="Generated ones, drawn; each is used often."),
+    click.option("--pool", type=OUT_FOLDER, help="Folder that keeps them, for several runs."),
+    click.option("--minutes", type=DURATION, help="Stop after so long; the same command goes on."),
+)
 
 
 @click.command()
@@ -31,14 +53,14 @@ _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 @click.option("--minutes", type=DURATION, help="Stop after so long; the same command goes on.")
 @click.option(
     "--labels",
-    type=_FOLDER,
+    type=FOLDER,
     help="Label volumes of your own (.nii, .nii.gz, .nrrd, .mha, .mhd): half of the scenes.",
 )
 @click.option("--learning-rate", type=RATE, help="The preset's otherwise.")
 @click.option(
     "--seed", type=click.IntRange(1), help="Of the scenes; a tuning wants another than its model's."
 )
-@click.option("--warm-start", type=_FILE, help="Go on from the weights of this model (.onnx).")
+@click.option("--warm-start", type=FILE, help="Go on from the weights of this model (.onnx).")
 def train(
     out: Path,
     network: str,
@@ -64,26 +86,16 @@ def train(
 
 
 @click.command("train-segmenter")
-@click.option("--out", type=OUT_FOLDER, required=True, help="Folder of the run.")
 @click.option("--preset", type=click.Choice(["cpu", "gpu"]), default="cpu", show_default=True)
-@click.option("--steps", type=COUNT, help="Steps in all.")
-@click.option("--decay-steps", type=COUNT, help="Length of the final decay.")
+@_on_pictures
 @click.option("--warmup-steps", type=COUNT, help="Length of the rise at the start.")
-@click.option("--batch", type=COUNT, help="Pictures of a step.")
-@click.option("--learning-rate", type=RATE)
-@click.option("--seed", type=SEED, help="Of the generated pictures and the crops.")
-@click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
-@click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
 @click.option(
     "--folds", type=click.IntRange(2), help="Train as many beside it, each without one such part."
 )
 @click.option(
     "--real-share", type=Number(0, 1), help="Of the pictures of a step, where there are any."
 )
-@click.option("--pictures", type=COUNT, help="Generated ones that are drawn; each is used often.")
-@click.option("--pool", type=OUT_FOLDER, help="Folder that keeps them, for several runs.")
-@click.option("--warm-start", type=_FILE, help="Checkpoint or ONNX model to begin with.")
-@click.option("--minutes", type=DURATION, help="Stop after so long; the same command goes on.")
+@click.option("--warm-start", type=FILE, help="Checkpoint or ONNX model to begin with.")
 def train_segmenter(
     out: Path, preset: str, warm_start: Path | None, pool: Path | None, minutes: float | None,
     **given: Any,
@@ -102,18 +114,8 @@ def train_segmenter(
 
 
 @click.command("train-devices")
-@click.option("--out", type=OUT_FOLDER, required=True, help="Folder of the run.")
-@click.option("--steps", type=COUNT, help="Steps in all.")
-@click.option("--decay-steps", type=COUNT, help="Length of the final decay.")
-@click.option("--batch", type=COUNT, help="Pictures of a step.")
-@click.option("--learning-rate", type=RATE)
-@click.option("--seed", type=SEED, help="Of the pictures.")
-@click.option("--real", type=_FOLDER, help="Real angiograms to train on: N.png, N_gt.png.")
-@click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out.")
-@click.option("--pictures", type=COUNT, help="That are drawn; each is used often.")
-@click.option("--pool", type=OUT_FOLDER, help="Folder that keeps them, for several runs.")
-@click.option("--warm-start", type=_FILE, help="ONNX model whose device network goes on.")
-@click.option("--minutes", type=DURATION, help="Stop after so long; the same command goes on.")
+@_on_pictures
+@click.option("--warm-start", type=FILE, help="ONNX model whose device network goes on.")
 def train_devices(
     out: Path, pool: Path | None, warm_start: Path | None, minutes: float | None, **given: Any
 ) -> None:

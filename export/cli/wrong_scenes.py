@@ -7,23 +7,13 @@ from pathlib import Path
 import click
 
 from gcar_export.cli.evaluate import words
-from gcar_export.cli.options import COUNT, OUT_FOLDER, SEED
+from gcar_export.cli.options import FROM_ZERO, OUT_FOLDER, SEED, counted
 
 
 @click.command("wrong-scenes")
-@click.option(
-    "--trees", type=COUNT, default=6, show_default=True, help="Examinations that are spoilt."
-)
-@click.option(
-    "--right",
-    type=click.IntRange(0),
-    default=4,
-    show_default=True,
-    help="More right ones of each kind.",
-)
-@click.option(
-    "--seed", type=SEED, default=62_002, show_default=True, help="Population of generated trees."
-)
+@counted("--trees", 6, "Examinations that are spoilt.")
+@counted("--right", 4, "More right ones of each kind.", FROM_ZERO)
+@counted("--seed", 62_002, "Population of generated trees.", SEED)
 @click.option("--families", default="", help="Only these, comma-separated.")
 @click.option("--out", type=OUT_FOLDER, required=True, help="Rows (CSV), table.")
 def wrong_scenes(trees: int, right: int, seed: int, families: str, out: Path) -> None:
