@@ -96,25 +96,17 @@ def run_job(job: Job, settings: MethodSettings) -> Done:
     try:
         case = _case(job.label, job.data, job.protocol, job.views)
     except UsageError as error:
-        return _without_case(job, str(error))
+        return Done(row=_row(job, NO_CASE, str(error)), sides=None, truth_sides=None)
     solved = solve(case, job.method, settings)
     found = measure(case, solved)
-    row = {
-        "protocol": job.protocol,
-        "dataset": dataset(job.label),
+    row = _row(job, solved.status, solved.sentence) | {
         "case": case.name,
-        "method": job.method,
-        "views": job.views,
-        "status": solved.status,
-        "sentence": solved.sentence,
         "measures": {name: m.value for name, m in found.items()},
         "reasons": {name: m.reason for name, m in found.items() if m.reason is not None},
         "gaussians": solved.gaussians,
         "seconds": float(solved.seconds["total"]),
         "cpu_seconds": float(solved.seconds["cpu"]),
         "stages": {s: float(t) for s, t in solved.seconds.items() if s not in ("total", "cpu")},
-        "settings": job.digest,
-        "label_sha256": job.data,
     }
     finite = solved.volume is not None and bool(np.isfinite(solved.volume).all())
     return Done(
@@ -124,15 +116,16 @@ def run_job(job: Job, settings: MethodSettings) -> Done:
     )
 
 
-def _without_case(job: Job, reason: str) -> Done:
-    row = {
+def _row(job: Job, status: str, sentence: str) -> dict[str, Any]:
+    """Return a row that nothing was measured for."""
+    return {
         "protocol": job.protocol,
         "dataset": dataset(job.label),
         "case": job.case,
         "method": job.method,
         "views": job.views,
-        "status": NO_CASE,
-        "sentence": reason,
+        "status": status,
+        "sentence": sentence,
         "measures": {},
         "reasons": {},
         "gaussians": None,
@@ -142,7 +135,6 @@ def _without_case(job: Job, reason: str) -> Done:
         "settings": job.digest,
         "label_sha256": job.data,
     }
-    return Done(row=row, sides=None, truth_sides=None)
 
 
 def dataset(label: Path) -> str:
