@@ -100,7 +100,7 @@ export class Store extends EventTarget {
         Object.assign(this, { ran: asked, result });
         // Branches are numbered anew: the chosen one is known by its place. What was deleted
         // leaves none chosen, so that no second key deletes another.
-        if (result) this.chosen = before && !chosen ? 0 : again(result.scene.branches, chosen, before !== null);
+        if (result) this.chosen = before ? again(result.scene.branches, chosen) : worst(result.scene.branches);
         this.cursor = this.spot = null;
       }
       this.tell("finished");
@@ -124,9 +124,9 @@ export class Store extends EventTarget {
   branch(number) { return this.result?.scene.branches.find(b => b.branch === number) ?? null; }
 }
 
-/** The branch that runs where a chosen one did, 0 where none does; to begin with the worst. */
-function again(branches, chosen, had) {
-  if (!had || !chosen) return worst(branches);
+/** The branch that runs where a chosen one did; 0 where none does, or none was chosen. */
+function again(branches, chosen) {
+  if (!chosen) return 0;
   const gap = b => Math.hypot(...b.middle.map((x, k) => x - chosen.middle[k]));
   const near = [...branches].sort((a, b) => gap(a) - gap(b))[0];
   return near && gap(near) < SAME_MM ? near.branch : 0;
