@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from gcar_deploy.predict.encoding import (
 )
 from gcar_export.scenes.gantry import PAPER_VIEWS, USUAL_SPREAD_DEG, USUAL_VIEWS
 from gcar_export.shipping.row_blocks import in_blocks
-from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
+from gcar_export.training.checkpoint import network_of, read_manifest
 from gcar_export.training.dataset import PATH_CELLS, training_scene
 from gcar_export.training.examinations import FINE_CELLS_MM, PAPER_CELLS_MM
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
@@ -64,19 +64,11 @@ def load_checkpoint(path: Path) -> SparsePredictor | UNetPredictor:
     ModelError
         Either is damaged, or they do not belong together.
     """
-    manifest = read_manifest(path, ("sparse", "unet"))
-    config = dict(manifest["config"])
-    net: SparsePredictor | UNetPredictor
-    try:
-        config["width"] = tuple(config["width"])
-        if manifest.get("network", "sparse") == "unet":
-            net = UNetPredictor(UNetConfig(**config))
-        else:
-            net = SparsePredictor(SparseConfig(**config))
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, ZeroDivisionError) as error:
-        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
-    filled(net, read_tensors(path), path.name)
-    return net.eval()
+    networks: dict[str, Callable[..., SparsePredictor | UNetPredictor]] = {
+        "sparse": lambda width, **more: SparsePredictor(SparseConfig(width=width, **more)),
+        "unet": lambda width, **more: UNetPredictor(UNetConfig(width=width, **more)),
+    }
+    return network_of(path, networks)
 
 
 def deployed(checkpoint: Path) -> DeployedSparse | UNetPredictor:

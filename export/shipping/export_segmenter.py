@@ -32,7 +32,7 @@ from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.parity import PARITY
-from gcar_export.training.checkpoint import filled, read_manifest, read_tensors
+from gcar_export.training.checkpoint import network_of, read_manifest
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.segmenter_start import begin_with, devices_of
@@ -95,13 +95,8 @@ def load_segmenter_checkpoint(path: Path) -> MaskUNet:
         net = MaskUNet(MaskUNetConfig())
         begin_with(net, path)
         return net.eval()
-    config = dict(read_manifest(path, ("mask-unet",))["config"])
-    try:
-        net = MaskUNet(MaskUNetConfig(**{**config, "width": tuple(config["width"])}))
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
-    filled(net, read_tensors(path), path.name)
-    return net.eval()
+    networks = {"mask-unet": lambda width, **more: MaskUNet(MaskUNetConfig(width=width, **more))}
+    return network_of(path, networks)
 
 
 def load_device_checkpoint(path: Path) -> LineNet:
@@ -116,12 +111,7 @@ def load_device_checkpoint(path: Path) -> LineNet:
         net = LineNet(LineNetConfig())
         devices_of(net, path)
         return net.eval()
-    try:
-        net = LineNet(LineNetConfig(**read_manifest(path, ("line-net",))["config"]))
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
-    filled(net, read_tensors(path), path.name)
-    return net.eval()
+    return network_of(path, {"line-net": lambda **config: LineNet(LineNetConfig(**config))})
 
 
 class _CheckpointSession:

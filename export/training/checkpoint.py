@@ -7,9 +7,9 @@ beside it. Pickled checkpoints (``.pt``, ``.pth``) are programs and are not read
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -24,6 +24,7 @@ MAX_BYTES = 2**30
 MAX_MANIFEST_BYTES = 64 * 2**10
 #: widest layer and most stages that a manifest may ask for
 MAX_WIDTH = 4096
+N = TypeVar("N", bound=torch.nn.Module)
 #: what names of weights begin with, and of their mean (``mean_weights``) where one was kept
 WEIGHTS, MEAN = "net.", "mean."
 #: network of a manifest -> what its checkpoint is of, and what takes it
@@ -95,6 +96,29 @@ def weights(tensors: Mapping[str, torch.Tensor], prefix: str = WEIGHTS) -> dict[
 def best_weights(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return the mean of the weights where one was kept, else the weights."""
     return weights(tensors, MEAN) or weights(tensors)
+
+
+def network_of(path: Path, networks: Mapping[str, Callable[..., N]]) -> N:
+    """Build the network that a checkpoint is of, with its weights, ready to be asked.
+
+    Parameters
+    ----------
+    path : ``.safetensors`` beside its ``manifest.json``
+    networks : name in the manifest -> what makes the network of its ``config``
+
+    Raises
+    ------
+    ModelError
+        Either file is damaged, of another network, or they do not belong together.
+    """
+    manifest = read_manifest(path, tuple(networks))
+    config = {k: tuple(v) if isinstance(v, list) else v for k, v in manifest["config"].items()}
+    try:
+        net = networks[manifest.get("network", "sparse")](**config)
+    except (KeyError, TypeError, ValueError, RuntimeError, IndexError, ZeroDivisionError) as error:
+        raise ModelError(f"manifest.json of {path.name}: no such network ({error})") from None
+    filled(net, read_tensors(path), path.name)
+    return net.eval()
 
 
 def filled(module: torch.nn.Module, tensors: dict[str, torch.Tensor], name: str) -> None:
