@@ -23,7 +23,8 @@ class Grid:
     center_mm : (3,) middle of the block, mm LPS
     size_mm : (3,) full edge lengths, mm
     shape : (3,) number of voxels along x, y, z
-    bounds : whether vessels are looked for in it alone; otherwise wherever all views look
+    bounds : whether vessels are looked for in it alone; otherwise beside it too, where all views
+        show lines that nothing in it explains
     """
 
     center_mm: tuple[float, float, float]

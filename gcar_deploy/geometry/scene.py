@@ -115,7 +115,7 @@ class Scene:
 def default_grid(carms: list[CArm]) -> Grid:
     """Cube of 128^3 voxels round the isocentre whose middle sphere every view sees whole.
 
-    It bounds the volume alone: vessels that all views see beside it are vessels (``common_field``).
+    It bounds the volume alone, not where vessels are looked for (``Grid.bounds``).
     """
     radius = DEFAULT_EDGE_MM / 2
     for carm in carms:
