@@ -38,13 +38,14 @@ class Engine:
     threads : int, threads within one reconstruction; None for the number of cores, at most 4
     options : RunOptions; ``options.predict.predictor`` says which predictor
     session : an existing ``onnxruntime.InferenceSession`` of that model
+    segmenter_model : as ``model``, of the network that finds vessels in raw pictures
 
     Raises
     ------
     UsageError
         An option is out of its range (``config/ranges.py``).
     ModelError
-        The model given is missing, or a model is altered or unfit. Where no model is given and
+        A model given is missing, or a model is altered or unfit. Where no model is given and
         none is installed, the visual hull is thinned instead, and every result says so.
     """
 
@@ -55,6 +56,7 @@ class Engine:
         threads: int | None = None,
         options: RunOptions | None = None,
         session: Any = None,
+        segmenter_model: str | Path | None = None,
     ) -> None:
         self.options = options or RunOptions()
         check_options(self.options)
@@ -66,7 +68,8 @@ class Engine:
         self._segmenter: Segmenter | None = None
         self._further: dict[str, Predictor | None] = {}
         self._lock = threading.Lock()
-        if self.options.imaging.segmenter == "net":
+        self._segmenter_model = segmenter_model
+        if segmenter_model is not None or self.options.imaging.segmenter == "net":
             self._needed_segmenter("net")
 
     @property
@@ -95,7 +98,7 @@ class Engine:
             return None
         with self._lock:
             if self._segmenter is None:
-                self._segmenter = load_segmenter(wanted, self.threads)
+                self._segmenter = load_segmenter(wanted, self.threads, self._segmenter_model)
             return self._segmenter
 
     def _predictor_for(self, options: PredictOptions) -> tuple[Predictor | None, tuple[str, ...]]:

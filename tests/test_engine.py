@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import json
+import shutil
 import threading
 
 import cv2
@@ -16,6 +17,8 @@ from gcar_deploy import CArm, Engine, Result, RunOptions
 from gcar_deploy.config import PredictOptions
 from gcar_deploy.errors import CancelledError, GeometryError, ImageError, ModelError, UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
+from gcar_deploy.imaging.net import KIND
+from gcar_deploy.models import golden_path
 from gcar_deploy.selftest import tiny_case
 from tests.conftest import ready_case
 
@@ -60,6 +63,29 @@ def test_masks_alone_give_the_tree(case):
     off = cKDTree(tree.points()).query(found.tree.points())[0]
     missed = cKDTree(found.tree.points()).query(tree.points())[0]
     assert off.mean() < 1.0 and missed.mean() < 1.0
+
+
+def test_a_segmenter_of_ones_own_finds_the_vessels(case, tmp_path):
+    angiograms, grid, _ = case
+    mine = tmp_path / "mine.onnx"
+    shutil.copy(KIND.path, mine)
+    shutil.copy(golden_path(KIND.path), golden_path(mine))
+    spec = json.loads(KIND.path.with_suffix(".json").read_text())
+    mine.with_suffix(".json").write_text(json.dumps({**spec, "name": "mine"}))
+    # On an even ground no network would be asked.
+    ground = 1000 + 300 * np.sin(np.arange(angiograms[0].pixels.shape[1]) / 9)
+    raw = [
+        dataclasses.replace(
+            a, pixels=(ground * np.exp(-0.0005 * a.pixels)).astype(np.float32),
+            intensity=Intensity(kind="raw"),
+        )
+        for a in angiograms
+    ]  # fmt: skip
+    options = dataclasses.replace(HULL, imaging=dataclasses.replace(HULL.imaging, segmenter="net"))
+    found = Engine(threads=1, options=options, segmenter_model=mine).reconstruct(raw, grid)
+    assert found.segmenter["name"] == "mine"
+    with pytest.raises(ModelError, match=r"gone\.onnx"):
+        Engine(threads=1, options=HULL, segmenter_model=tmp_path / "gone.onnx")
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ class BatchCase:
         order = self.order.with_files(lambda _, path: Path(path.name))
         what = {"order": order.to_dict(), "engine": dataclasses.asdict(engine)}
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode())
-        for name, path in self.order.files.items():
+        for name, path in {**self.order.files, **engine.files}.items():
             try:
                 content = hashlib.sha256(path.read_bytes()).digest()
             except OSError:

@@ -21,10 +21,17 @@ COLUMNS = (
 
 @dataclasses.dataclass(frozen=True)
 class BatchEngine:
-    """Which engine does the cases: model file (None for the shipped one) and threads."""
+    """Which engine does the cases: model files (None for the shipped ones) and threads."""
 
     model: str | None = None
     threads: int | None = None
+    segmenter_model: str | None = None
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Return the model files that are named, each by its role."""
+        named = {"model": self.model, "segmenter_model": self.segmenter_model}
+        return {role: Path(file) for role, file in named.items() if file is not None}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,7 +88,12 @@ def _engine(engine: BatchEngine, predictor: str | None) -> Any:
     from gcar_deploy.engine import Engine
 
     options = Order(predictor=predictor).options(RunOptions())
-    return Engine(engine.model, threads=engine.threads, options=options)
+    return Engine(
+        engine.model,
+        threads=engine.threads,
+        options=options,
+        segmenter_model=engine.segmenter_model,
+    )
 
 
 def _solved(job: BatchJob) -> dict[str, Any]:

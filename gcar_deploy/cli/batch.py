@@ -89,13 +89,12 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
     from gcar_deploy.batch.work import BatchEngine
 
     cases = read_cases(table, dataclasses.replace(order, out=None, force=False))
-    model = None if engine.model is None else str(Path(engine.model).absolute())
     hidden = talk.quiet or not sys.stderr.isatty()
     with click.progressbar(length=len(cases), file=sys.stderr, hidden=hidden) as bar:
         rows = run_batch(
             cases,
             order.out,
-            BatchEngine(model, engine.threads),
+            BatchEngine(_full(engine.model), engine.threads, _full(engine.segmenter_model)),
             pool=Pool(jobs, where.scheduler),
             force=order.force,
             on_case=lambda done, *_: bar.update(done - bar.pos),
@@ -107,6 +106,10 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
     counts = Counter(row["status"] for row in rows)
     said = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
     say_result(f"{order.out}\n{len(rows)} cases: {said}\n{order.out / 'summary.html'}", order.out)
+
+
+def _full(file: str | None) -> str | None:
+    return None if file is None else str(Path(file).absolute())
 
 
 def _cores() -> int:

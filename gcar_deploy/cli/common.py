@@ -107,10 +107,11 @@ class Talk:
 
 @dataclasses.dataclass(frozen=True)
 class EngineChoice:
-    """Which engine does the work: model (None for the shipped one) and threads."""
+    """Which engine does the work: models (None for the shipped ones) and threads."""
 
     model: str | None
     threads: int | None
+    segmenter_model: str | None = None
 
     def limit_threads(self) -> None:
         """Hold every numerical library of this process; before they are imported."""
@@ -128,7 +129,12 @@ class EngineChoice:
         from gcar_deploy.engine import Engine
 
         options = order.options(RunOptions())
-        return Engine(self.model, threads=self.threads, options=options)
+        return Engine(
+            self.model,
+            threads=self.threads,
+            options=options,
+            segmenter_model=self.segmenter_model,
+        )
 
 
 def say_result(text: str, folder: Path) -> None:
@@ -165,12 +171,22 @@ def talk_options(*wanted: str) -> Callable[[_Function], Any]:
 
 
 def engine_options(function: _Function) -> Any:
-    """Add --model and --threads; they come as the argument ``engine``."""
-    model = click.option(
-        "--model", type=click.Path(), help="Predictor as an ONNX file; spec beside it."
-    )
-    threads = click.option("--threads", type=click.IntRange(1, 256), help="At most so many.")
-    return gathered("engine", EngineChoice, {"threads": threads, "model": model})(function)
+    """Add the models and --threads; they come as the argument ``engine``."""
+    known = {
+        "threads": click.option("--threads", type=click.IntRange(1, 256), help="At most so many."),
+        "segmenter_model": segmenter_option,
+        "model": click.option(
+            "--model", type=click.Path(), help="Predictor as an ONNX file; spec beside it."
+        ),
+    }
+    return gathered("engine", EngineChoice, known)(function)
+
+
+segmenter_option = click.option(
+    "--segmenter-model",
+    type=click.Path(),
+    help="What finds vessels in raw pictures, as an ONNX file; spec beside it.",
+)
 
 
 def gathered(

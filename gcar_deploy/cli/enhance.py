@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import gathered
+from gcar_deploy.cli.common import gathered, segmenter_option
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.config import SEGMENTERS
 from gcar_deploy.inputs.order import Order
@@ -56,7 +56,10 @@ _MEANING = {
     show_default=True,
     help="Who finds the vessels; both writes classic and net_ pictures side by side.",
 )
-def enhance(picture: Path, order: Order, meaning: Meaning, segmenter: str) -> None:
+@segmenter_option
+def enhance(
+    picture: Path, order: Order, meaning: Meaning, segmenter: str, segmenter_model: str | None
+) -> None:
     """Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
 
     And steps.png: the vesselness with the skeleton in green and, in red, what was taken for a
@@ -86,7 +89,9 @@ def enhance(picture: Path, order: Order, meaning: Meaning, segmenter: str) -> No
     pictures: dict[str, bytes] = {}
     for who in ("classic", "net") if segmenter == "both" else (segmenter,):
         chosen = dataclasses.replace(options, segmenter=who)
-        network, missing = asked_network([angiogram], chosen, load_segmenter(who))
+        network, missing = asked_network(
+            [angiogram], chosen, load_segmenter(who, model=segmenter_model)
+        )
         for note in missing:
             click.echo(f"gcar: {note}", err=True)
         found = extract_vessels(angiogram, chosen, network)

@@ -193,18 +193,26 @@ def open_segmenter(path: Path, *, threads: int = 2) -> Segmenter:
     return Segmenter(Session(model, INPUTS, threads=threads, arena=False))
 
 
-def load_segmenter(wanted: str, threads: int = 2) -> Segmenter | None:
-    """Open the shipped network where ``wanted`` needs it; None where ``auto`` finds none.
+def load_segmenter(
+    wanted: str, threads: int = 2, model: str | Path | None = None
+) -> Segmenter | None:
+    """Open the network where ``wanted`` needs it; None where ``auto`` finds none.
+
+    Parameters
+    ----------
+    wanted : who finds vessels
+    threads : int
+    model : path of an ONNX file with its spec beside it; None for the shipped one
 
     Raises
     ------
     UsageError
         Nobody of that name finds vessels.
     ModelError
-        ``net`` is wanted and the network is missing, or it is altered.
+        ``net`` is wanted and the network is missing; the one given is missing, or it is altered.
     """
     check_choice("segmenter", wanted, SEGMENTERS)
-    path = KIND.path
+    path = KIND.path if model is None else Path(model)
     if wanted == "classic" or (path is None and wanted == "auto"):
         return None
     if path is None:

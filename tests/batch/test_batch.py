@@ -117,6 +117,20 @@ def test_a_changed_case_is_not_passed_off_as_the_old_one(table, tmp_path, monkey
         run_batch(cases, tmp_path / "out", ENGINE)
 
 
+@pytest.mark.parametrize("role", ["model", "segmenter_model"])
+def test_a_model_file_that_changed_is_another_engine(table, tmp_path, monkeypatch, role):
+    rows_without_processes(monkeypatch)
+    (case,) = (case for case in read_cases(table) if case.name == "missing")
+    file = tmp_path / "mine.onnx"
+    file.write_bytes(b"first")
+    engine = BatchEngine(threads=1, **{role: str(file)})
+    rows = run_batch([case], tmp_path / "out", engine)
+    assert run_batch([case], tmp_path / "out", engine) == rows
+    file.write_bytes(b"second")
+    with pytest.raises(UsageError, match=r"'missing'.*--force"):
+        run_batch([case], tmp_path / "out", engine)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
