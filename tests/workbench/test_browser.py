@@ -347,6 +347,30 @@ def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width):
 
 
 @pytest.mark.slow
+def test_pictures_in_the_wrong_order_are_exchanged(serve, browse):
+    """What was drawn stays with its picture, and so does the name."""
+    from gcar_deploy.data.demo_case import demo_case
+
+    case = demo_case()
+    given = Order(views=case.pictures[::-1], geometry=case.geometry)
+    address, cases = serve(lambda desk: desk.add(desk.new_folder("mixed"), given).id)
+    page = browse(address)
+    assert finished(page) != "ok"
+    page.click("button[data-tool=erase]")
+    stroke(page, 1, [(20, 20), (60, 20)])
+    until_order(page, cases / "mixed", lambda order: "edits" in order)
+    page.click("#geometry summary")
+    page.click("#geometry .order button")
+    until(page, lambda: finished(page) == "ok")
+    order = order_of(cases / "mixed")
+    assert list(order["edits"]) == ["1"] and order["views"] == [str(p) for p in given.views]
+    told = json.loads(case.geometry.read_text())["views"]
+    angles = [view["primary_angle_deg"] for view in told]
+    assert [view["primary_angle_deg"] for view in order["geometry"]["views"]] == angles[::-1]
+    assert [view["id"] for view in order["geometry"]["views"]] == [v["id"] for v in told]
+
+
+@pytest.mark.slow
 def test_one_printed_page(serve, browse):
     address, _ = serve(lambda desk: desk.demo().id)
     page = browse(address)

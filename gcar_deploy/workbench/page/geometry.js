@@ -14,11 +14,30 @@ const FIELDS = [
 
 /** Show one card a view; what is edited becomes part of the order. */
 export function geometry(store, say) {
-  const cards = $("geometry").querySelector(".cards");
+  const [cards, order] = [".cards", ".order"].map(name => $("geometry").querySelector(name));
   const told = store.info.geometry;
+  order.replaceChildren();
   if (!told && store.info.sizes) { cards.replaceChildren(asked(store, say)); return; }
   if (!told) { cards.replaceChildren(el("p", {}, store.info.problem ?? "Not known.")); return; }
+  // A header's geometry belongs to its picture.
+  const mixed = store.info.order.geometry && told.views.length > 1;
   cards.replaceChildren(...told.views.map((view, k) => card(store, say, view, k)));
+  if (mixed) order.replaceChildren(...told.views.slice(1).map((_, k) => exchange(store, say, k)), "for pictures that came in the wrong order");
+}
+
+/** A button for pictures that came in the wrong order: what was drawn in them stays with them. */
+function exchange(store, say, k) {
+  const onclick = async () => {
+    const told = structuredClone(store.info.geometry), [a, b] = told.views.slice(k, k + 2);
+    // What a picture is called and what its counts mean are the picture's own.
+    const of = (whole, { id, intensity }) => {
+      const { id: _, intensity: __, ...placed } = whole;
+      return { ...id !== undefined && { id }, ...placed, ...intensity !== undefined && { intensity } };
+    };
+    told.views.splice(k, 2, of(b, a), of(a, b));
+    try { await store.change({ geometry: told }); say(""); if (!store.info.problem) await store.run(); } catch (error) { say(error.message); }
+  };
+  return el("button", { type: "button", onclick }, `Exchange the geometry of views ${k + 1} and ${k + 2}`);
 }
 
 /** A form for pictures that came without their geometry: nothing is guessed, all is asked. */
