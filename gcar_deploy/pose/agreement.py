@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gcar_deploy.config import PoseOptions, RunOptions
-from gcar_deploy.geometry.consistency import Mass, disagreement, vessel_mass
+from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.imaging.widths import by_width, others_too, own_widths
@@ -309,6 +309,29 @@ def order_of(
     i, j = min(orders, key=lambda pair: orders[pair])
     ids = views[i].view_id, views[j].view_id
     return check_order(ids, given, orders[i, j], kind_of(views), options.quality)
+
+
+def scale_hint(views: Sequence[VesselImage], poses: Sequence[Pose], options: RunOptions) -> str:
+    """Say where two views contradict each other by the scale of their path lengths alone.
+
+    With the geometry as it is told, their paths then add up to different sums, but to the same in
+    every epipolar plane but for that factor; empty of others, and of views that agree.
+    """
+    good, most = disagreement_limits(kind_of(views), options.quality)
+    if len(views) != 2 or kind_of(views) != "exact" or worst_of(poses) <= most:
+        return ""
+    (fixed, moving), smoothing = profiled(views, options)
+    if fixed is None or moving is None:
+        return ""
+    a, b = mass_profiles(fixed, moving, moving.carm, smoothing.fine_mm)
+    ratio = float(b.sum() / a.sum())
+    if 0.5 * np.abs(a / a.sum() - b / b.sum()).sum() > good:
+        return ""
+    first, second = views[0].view_id, views[1].view_id
+    return (
+        f"the paths of view {second} add up to {ratio:.2g} times those of view {first}, and are "
+        "alike but for that: is mm_per_count right of both?"
+    )
 
 
 def _agreed(views: Sequence[VesselImage], options: RunOptions) -> float:

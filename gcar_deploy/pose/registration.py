@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from gcar_deploy.config import Landmark, RunOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.pose.agreement import agreeing, order_of, with_motion
+from gcar_deploy.pose.agreement import agreeing, order_of, scale_hint, with_motion
 from gcar_deploy.pose.bundling import TreeOf, bundled, posed
 from gcar_deploy.pose.pairwise import Pose, worst_of
 from gcar_deploy.pose.significance import asked
@@ -108,6 +108,7 @@ def register(
     rigid = bundled(views, poses, tree_of, options)
     order, hint = order_of(views, rigid, options)
     findings += order
+    hint = hint or scale_hint(views, rigid, options)
     # Pictures that agree far better the other way round are swapped: no heart has moved.
     poses = rigid if hint else with_motion(views, rigid, options)
     motions = [

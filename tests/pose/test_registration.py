@@ -46,6 +46,18 @@ def test_two_trees_are_refused_when_asked_with_what_was_measured():
 
 
 @pytest.mark.slow
+def test_paths_of_another_scale_are_named_and_those_of_another_tree_are_not():
+    angiograms, views = pair(calibrated=True)
+    by_eight = dataclasses.replace(views[1], path_mm=views[1].path_mm / np.float32(8))
+    with pytest.raises(RefusedError, match=r"add up to 0\.1[23] times.*mm_per_count right"):
+        register(angiograms, [views[0], by_eight], OPTIONS, never).or_refuse()
+    _, others = pair(seeds=(4, 9), calibrated=True)
+    by_eight = dataclasses.replace(others[1], path_mm=others[1].path_mm / np.float32(8))
+    placed = register(angiograms, [others[0], by_eight], OPTIONS, never)
+    assert "contradict" in placed.refusal and "mm_per_count" not in placed.refusal
+
+
+@pytest.mark.slow
 def test_outlines_of_two_trees_that_agree_by_chance_are_refused_by_where_vessels_end(monkeypatch):
     angiograms, views = pair(seeds=(4, 9), stranger=True)
     placed = register(angiograms, views, OPTIONS, never)
