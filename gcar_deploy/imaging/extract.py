@@ -46,6 +46,8 @@ MIN_LENGTH_MM, EVEN_LENGTH_MM = 25.0, 10.0
 MIN_CONTRAST, NET_MIN_CONTRAST = 6.0, 3.0
 #: and the peak, as a share of the white level, must be seen at all
 MIN_PEAK = 0.03
+#: grey values are no darker than this share of the white level: half a step of 16 bits
+BLACK = 2.0**-17
 #: vessels never fill more than this share of a picture
 _FULL = 0.9
 
@@ -403,7 +405,9 @@ def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Imag
     if not dark:  # a negative: turn it back, so that Beer's law can be tried on it
         level = float(level.max()) - level
     holes = collimator(pixels, negative=not dark)
-    floor = np.float32(0.5 / white)  # half a count: black stays finite
+    # Half of the darkest grey value that is one: black stays finite, whatever a count is.
+    darkest = float(np.min(level, where=level > 0, initial=np.inf))
+    floor = np.float32(min(max(0.5 * darkest, BLACK), 1.0))
     return {
         "search": enhance.absorbance(level),
         "display": -np.log(np.clip(level, 0, None) + np.float32(enhance.DISPLAY_OFFSET)),

@@ -10,6 +10,7 @@ from gcar_deploy.errors import GeometryError, ImageError, RefusedError
 from gcar_deploy.imaging.extract import (
     CONTRAST_ERROR,
     asks_network,
+    bright_vessels,
     extract_vessels,
 )
 from gcar_deploy.imaging.polarity import with_polarity
@@ -347,3 +348,14 @@ def test_real_and_simulated_pictures():
     for name, scores, _, _ in table.case_scores(cases):
         assert scores["Dice"] > 0.8 and scores["clDice"] > 0.9, name
         assert scores["correlation"] > 0.85 and 0.75 < scores["scale"] < 1.25, name
+
+
+@pytest.mark.parametrize("dark", [True, False])
+@pytest.mark.parametrize("by", [1 / 255, 257.0])
+def test_grey_values_may_be_counted_in_any_unit(dark, by):
+    counts = np.random.default_rng(3).integers(0, 256, (64, 64)).astype(np.float32)
+    laws, _ = bright_vessels(counts, "raw", dark)
+    scaled, _ = bright_vessels(counts * np.float32(by), "raw", dark)
+    assert laws["log"].max() > 5
+    for law, picture in laws.items():
+        np.testing.assert_allclose(scaled[law], picture, atol=1e-4, err_msg=law)
