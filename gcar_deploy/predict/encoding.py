@@ -15,7 +15,7 @@ import numpy as np
 
 from gcar_deploy.beside import side_by_side, started
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.predict.hull import Candidates, bilinear_of
+from gcar_deploy.predict.hull import OFF_MIDDLE, Candidates, bilinear_of
 from gcar_deploy.types import Array, Image
 
 #: number of per-view features that ``encode`` makes; part of the model's spec
@@ -68,7 +68,7 @@ def encode(candidates: Candidates, views: Sequence[tuple[CArm, Image, bool]]) ->
         As given to ``visual_hull``; ``calibrated`` says whether path lengths are true mm.
     """
     h = candidates.spacing_mm
-    levels = started(functools.partial(_levels, candidates.index))
+    levels = started(functools.partial(_levels, _index_in_scene(candidates)))
     per_view = side_by_side(
         [functools.partial(_view_inputs, candidates, *view, h) for view in views]
     )
@@ -146,6 +146,20 @@ def _view_inputs(
     ).astype(np.float32)
     ray_path = path.ravel()[flat]
     return features, ray.reshape(-1).astype(np.int64), ray_path, weight.astype(np.float32)
+
+
+def _index_in_scene(candidates: Candidates) -> Array:
+    """(n, 3) index of which coarser cells are made, the same whatever border a picture has.
+
+    Where nobody asked for a volume, the corner that indices are counted from follows the size of
+    the pictures: it counts in whole cells of the coarsest level.
+    """
+    lattice, h = candidates.lattice, candidates.spacing_mm
+    if lattice.bounds:
+        return candidates.index
+    # A lattice that is shifted by less than a cell has the corner of the one it was made of.
+    corner = np.floor((lattice.lower_mm + 0.5 * h) / h - OFF_MIDDLE + 1e-3).astype(np.int64)
+    return candidates.index + corner % 2**LEVELS
 
 
 def _levels(index: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:

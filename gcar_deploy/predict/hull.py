@@ -64,6 +64,7 @@ def cubic_lattice(grid: Grid, spacing_mm: float) -> Grid:
         center_mm=(float(center[0]), float(center[1]), float(center[2])),
         size_mm=(float(size[0]), float(size[1]), float(size[2])),
         shape=(int(shape[0]), int(shape[1]), int(shape[2])),
+        bounds=grid.bounds,
     )
 
 

@@ -1,5 +1,6 @@
 """Neighbour tables, coarse levels and rays against slow, obvious twins."""
 
+import dataclasses
 from unittest import mock
 
 import numpy as np
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 from gcar_deploy.config import CandidateOptions
 from gcar_deploy.predict import encoding
 from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES, _levels, _neighbours, encode
-from gcar_deploy.predict.hull import visual_hull
+from gcar_deploy.predict.hull import cubic_lattice, visual_hull
+from gcar_deploy.predict.lattices import shifted_lattice
 from gcar_deploy.predict.thinning import thin_hull
 
 pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
@@ -53,6 +55,22 @@ def test_levels_lead_to_the_cell_that_holds_the_point():
         np.testing.assert_array_equal(coarse[parent[level]], fine // 2)
         assert len(neighbours[level + 1]) == len(coarse)
         fine = coarse
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 3])
+def test_what_a_border_adds_to_the_default_volume_changes_no_coarser_cell(number):
+    views = [(*one, True) for one in scene()]
+    paths = [one[:2] for one in views]
+    found = []
+    for cells in range(96, 113):
+        space = dataclasses.replace(GRID, size_mm=(cells + 0.3,) * 3, bounds=False)
+        lattice = shifted_lattice(cubic_lattice(space, 1.0), number)
+        found.append(encode(visual_hull(paths, lattice, CandidateOptions()), views))
+    assert len({len(one.parent[0]) for one in found}) == 1
+    for one in found[1:]:
+        for name in ("parent", "neighbours", "children"):
+            for a, b in zip(getattr(one, name), getattr(found[0], name), strict=True):
+                np.testing.assert_array_equal(a, b)
 
 
 def test_members_and_children_are_rays_and_parents_inverted():
