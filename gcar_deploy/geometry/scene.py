@@ -371,7 +371,9 @@ def _check_placing(scene: Scene) -> None:
                 f"view {view.id}: volume reaches to {depth.min():.0f} mm from the source; "
                 "50 mm at least are needed (sod_mm too small or volume.size_mm too large)"
             )
-        if view.carm.projection_matrix is None and depth.max() > view.carm.sdd_mm:
+        # The default volume may reach behind it: whoever named no volume named none too large.
+        near = view.carm.projection_matrix is None and grid.bounds
+        if near and depth.max() > view.carm.sdd_mm:
             raise GeometryError(
                 f"view {view.id}: volume reaches {depth.max() - view.carm.sdd_mm:.0f} mm behind "
                 "the detector (sdd_mm too small or volume.size_mm too large)"

@@ -56,6 +56,15 @@ def test_all_that_every_view_sees_is_in_the_box(seed):
     ).all()
 
 
+def test_a_picture_cut_near_the_central_ray_makes_no_room_of_too_many_voxels():
+    whole = two_views()
+    carms = [dataclasses.replace(one, principal_point_px=(9.5, 12.5)) for one in whole]
+    grid = default_grid(carms)
+    assert grid.spacing_mm[0] < 0.1
+    box = common_field(grid, carms)
+    assert np.min(box.size_mm) > 50 > grid.size_mm[0]
+
+
 def test_a_volume_that_is_asked_for_bounds():
     carms = two_views()
     grid = default_grid(carms)

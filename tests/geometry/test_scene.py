@@ -360,3 +360,12 @@ def test_row_spacing_comes_first():
     f_col, f_row = carm.focal_px
     assert f_col == pytest.approx(carm.sdd_mm / 0.4)
     assert f_row == pytest.approx(carm.sdd_mm / 0.2)
+
+
+def test_a_default_volume_may_reach_behind_the_detector():
+    """A projection matrix does not tell where that is: both ways of telling must agree."""
+    near = changed((*FIRST, "sdd_mm"), SCENE["views"][0]["sod_mm"] + 60)
+    with pytest.raises(GeometryError, match="behind the detector"):
+        parse_scene(json.dumps(near))
+    near["volume"] = None
+    assert parse_scene(json.dumps(near)).volume_grid().size_mm[0] > 120 / np.sqrt(3)
