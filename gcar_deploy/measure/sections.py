@@ -20,6 +20,7 @@ from gcar_deploy.beside import side_by_side
 from gcar_deploy.measure.overlaps import Course, hidden_samples, within_others
 from gcar_deploy.measure.profile import DEPTH, GROUND, HALF, Belief, Fitted, Profiles, fit_profiles
 from gcar_deploy.measure.signals import Signal
+from gcar_deploy.measure.silhouette import covered
 from gcar_deploy.tree.tree import Branch, Tree, along
 from gcar_deploy.types import Array, Points, Scalars
 
@@ -108,9 +109,10 @@ class _Seen:
     log_radius: Scalars
     sd: Scalars
     width_mm: Scalars
-    foreshortened: Array
+    sine: Scalars
     overlapped: Array
     shared: float
+    outline: bool
 
 
 def measure_sections(tree: Tree, signals: Sequence[Signal]) -> tuple[Sections, ...]:
@@ -212,7 +214,8 @@ def _seen(places: _Places, signal: Signal) -> _Seen:
     sd = np.where(overlapped | (sine < 0.2), np.maximum(sd, 1.0), sd)
     # Errors that neighbours share are not averaged by joining them: they widen what is stated.
     shared = 1.0 if signal.kind != "contrast" else np.sqrt(CORRELATED_GREY / CORRELATED)
-    return _Seen(log_radius, sd, width, sine < SHORT_SINE, overlapped, float(shared))
+    outline = signal.kind == "mask"
+    return _Seen(log_radius, sd, width, sine, overlapped, float(shared), outline)
 
 
 def _fitted(
@@ -369,6 +372,9 @@ def _joined(places: _Places, own: Array, seen: Sequence[_Seen]) -> Sections:
     arc = places.arc_mm[own]
     value = np.stack([view.log_radius[own] for view in seen])
     sd = np.stack([view.sd[own] for view in seen])
+    if all(view.outline for view in seen):
+        sine = np.stack([view.sine[own] for view in seen])
+        sd = np.where(covered(arc, np.exp(value), sd, sine), np.maximum(sd, 1.0), sd)
     alone = np.count_nonzero(sd < UNKNOWN_SD_LOG, axis=0) < min(len(seen), 2)
     sd = np.hypot(sd, ALONE_SD * alone)
     start = np.log(places.radius_mm[own])
@@ -395,7 +401,7 @@ def _joined(places: _Places, own: Array, seen: Sequence[_Seen]) -> Sections:
         sigma_mm=diameter * spread,
         measured=known,
         width_mm=np.where(sd < 1.0, np.stack([view.width_mm[own] for view in seen]), np.nan),
-        foreshortened=np.stack([view.foreshortened[own] for view in seen]),
+        foreshortened=np.stack([view.sine[own] < SHORT_SINE for view in seen]),
         overlapped=np.stack([view.overlapped[own] for view in seen]),
     )
 

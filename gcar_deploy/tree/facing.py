@@ -16,8 +16,9 @@ from gcar_deploy.types import Points
 MOST_TURN_DEG = 50.0
 #: an end's direction is taken over so much of its branch, mm
 DIRECTION_MM = 4.0
-#: a shorter piece bridges nothing, mm: scraps point anywhere
-LEAST_PIECE_MM = 8.0
+#: a shorter part bridges nothing, mm: scraps point anywhere; nor does a shorter branch, as between
+#: a fork and a lesion behind it
+LEAST_PART_MM, LEAST_BRANCH_MM = 8.0, 2.0
 #: distance between the points of a bridge, mm
 STEP_MM = 0.5
 
@@ -79,13 +80,14 @@ def joined_ends(tree: Tree, bridge: Bridge, most_gap_mm: float) -> Tree:
 
 def _free_ends(tree: Tree) -> list[FreeEnd]:
     degrees, out = tree.degrees, []
+    whole = tree.part_lengths_mm()[tree.parts()]
     for k, branch in enumerate(tree.branches):
-        if branch.length_mm < LEAST_PIECE_MM:
+        if whole[k] < LEAST_PART_MM or branch.length_mm < LEAST_BRANCH_MM:
             continue
         arc = branch.arc_mm
         for point, node, inner in (
-            (0, branch.start, DIRECTION_MM),
-            (-1, branch.end, arc[-1] - DIRECTION_MM),
+            (0, branch.start, min(DIRECTION_MM, arc[-1])),
+            (-1, branch.end, max(arc[-1] - DIRECTION_MM, 0.0)),
         ):
             if degrees[node] == 1:
                 way = branch.points_mm[point] - along(branch.points_mm, arc, np.array(inner))

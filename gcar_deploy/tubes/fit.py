@@ -135,6 +135,10 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: Run) -> TubeFit:
         return dataclasses.replace(start, tree=now.tree, contrast=contrast)
     if not (options.levels_mm[-1] or progress.stopped or progress.failed):
         now = settled_topology(now, views, targets, run)
+        # Fitted ends point better than the points' did.
+        whole = joined_in_pictures(now.tree, views)
+        if whole is not now.tree:
+            now = run.fit(whole, targets, options.steps[-1])
         now = _with_refitted_radii(now, targets, options)
     targets = rescaled(targets, now.prints)
     own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))

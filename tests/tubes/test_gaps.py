@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from gcar_deploy.config import TubeOptions
 from gcar_deploy.engine import Engine
+from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes.fit import TubeFit, _fitted
 from gcar_deploy.tubes.gaps import joined_in_pictures
+from gcar_deploy.tubes.gauss_newton import Progress
+from gcar_deploy.tubes.run import Run
 from tests.tree.shapes import branch
 from tests.tubes.scenes import seen, two_views
 
@@ -83,6 +88,50 @@ def test_vessel_beside_the_gap_is_another():
     ]
     tree = broken()
     assert joined_in_pictures(tree, pictures) is tree
+
+
+def test_a_lesion_just_behind_a_fork_is_bridged_and_a_scrap_is_not():
+    side = LINE[50] + np.linspace(0, 12, 25)[:, None] * [0.0, 0.0, 1.0]
+    whole, cut = vessel(radius=narrowed(0.3)), broken()
+    pieces = (LINE[:51], LINE[50:61], side, LINE[80:])
+    stub = Tree(
+        nodes_mm=np.stack([LINE[0], LINE[50], LINE[60], side[-1], LINE[80], LINE[-1]]),
+        branches=tuple(
+            branch(line, np.full(len(line), 1.4), *ends)
+            for line, ends in zip(pieces, ((0, 1), (1, 2), (1, 3), (4, 5)), strict=True)
+        ),
+    )
+    assert stub.branches[1].length_mm < 5.0
+    tree = joined_in_pictures(stub, seen(whole, two_views()))
+    assert len(stub.part_lengths_mm()) == 2 and len(tree.part_lengths_mm()) == 1
+    scrap = Tree(
+        nodes_mm=np.stack([*cut.nodes_mm[:2], LINE[66], LINE[76]]),
+        branches=(cut.branches[0], branch(LINE[66:77], np.full(11, 1.4), 2, 3)),
+    )
+    assert len(joined_in_pictures(scrap, seen(whole, two_views())).part_lengths_mm()) == 2
+
+
+def test_ends_that_the_fit_has_turned_are_asked_again():
+    """Of the points' tree they point past each other; the pictures turn them."""
+    views = seen(vessel(radius=narrowed(0.3)), two_views())
+    aside = np.clip((ARC - ARC[52]) / (ARC[60] - ARC[52]), 0, 1)[:, None] * [0.0, 0.0, 3.5]
+    start = broken()
+    bent = dataclasses.replace(start.branches[0], points_mm=(LINE + aside)[:61])
+    start = Tree(
+        nodes_mm=np.concatenate([bent.points_mm[[0, -1]], start.nodes_mm[2:]]),
+        branches=(bent, start.branches[1]),
+    )
+    assert joined_in_pictures(start, views) is start
+    points = CenterPoints(
+        points_mm=start.points(), confidence=np.ones(len(start.points())),
+        radius_mm=start.radii(), spacing_mm=1.0, source="multi",
+    )  # fmt: skip
+    given = TubeFit(
+        tree=start, centers=points, scatter_mm=0.0, contrast=(1.0, 1.0), progress=Progress()
+    )
+    found = _fitted(given, views, Run(TubeOptions(), given.progress, None, None))
+    assert len(found.tree.part_lengths_mm()) == 1
+    assert cKDTree(found.tree.points()).query(LINE)[0].max() < 1.0
 
 
 def test_ends_far_from_each_other_stay_ends():
