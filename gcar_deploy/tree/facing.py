@@ -16,9 +16,8 @@ from gcar_deploy.types import Points
 MOST_TURN_DEG = 50.0
 #: an end's direction is taken over so much of its branch, mm
 DIRECTION_MM = 4.0
-#: a shorter part bridges nothing, mm: scraps point anywhere; nor does a shorter branch, as between
-#: a fork and a lesion behind it
-LEAST_PART_MM, LEAST_BRANCH_MM = 8.0, 2.0
+#: a shorter part bridges nothing, mm: scraps point anywhere
+LEAST_PART_MM = 8.0
 #: distance between the points of a bridge, mm
 STEP_MM = 0.5
 
@@ -39,7 +38,9 @@ class FreeEnd:
 Bridge = Callable[[FreeEnd, FreeEnd, Points], Branch | None]
 
 
-def joined_ends(tree: Tree, bridge: Bridge, most_gap_mm: float) -> Tree:
+def joined_ends(
+    tree: Tree, bridge: Bridge, most_gap_mm: float, least_branch_mm: float = LEAST_PART_MM
+) -> Tree:
     """Join ends of separate parts that face each other, the shortest gap first.
 
     Parameters
@@ -47,6 +48,7 @@ def joined_ends(tree: Tree, bridge: Bridge, most_gap_mm: float) -> Tree:
     tree : Tree, mm
     bridge : asked of each gap in turn, along a smooth curve from end to end
     most_gap_mm : no longer gap is asked for
+    least_branch_mm : nor one at the end of a shorter branch
 
     Returns
     -------
@@ -54,7 +56,7 @@ def joined_ends(tree: Tree, bridge: Bridge, most_gap_mm: float) -> Tree:
     """
     if len(tree.branches) < 2:
         return tree
-    ends, component = _free_ends(tree), tree.components()
+    ends, component = _free_ends(tree, least_branch_mm), tree.components()
     wanted = [
         (gap, a, b)
         for a, b in itertools.combinations(ends, 2)
@@ -78,11 +80,11 @@ def joined_ends(tree: Tree, bridge: Bridge, most_gap_mm: float) -> Tree:
     return merged(dataclasses.replace(tree, branches=(*tree.branches, *bridges)))
 
 
-def _free_ends(tree: Tree) -> list[FreeEnd]:
+def _free_ends(tree: Tree, least_branch_mm: float) -> list[FreeEnd]:
     degrees, out = tree.degrees, []
     whole = tree.part_lengths_mm()[tree.parts()]
     for k, branch in enumerate(tree.branches):
-        if whole[k] < LEAST_PART_MM or branch.length_mm < LEAST_BRANCH_MM:
+        if whole[k] < LEAST_PART_MM or branch.length_mm < least_branch_mm:
             continue
         arc = branch.arc_mm
         for point, node, inner in (

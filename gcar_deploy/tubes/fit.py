@@ -136,7 +136,7 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: Run) -> TubeFit:
     if not (options.levels_mm[-1] or progress.stopped or progress.failed):
         now = settled_topology(now, views, targets, run)
         # Fitted ends point better than the points' did.
-        whole = joined_in_pictures(now.tree, views)
+        whole = joined_in_pictures(now.tree, views, fitted=True)
         if whole is not now.tree:
             now = run.fit(whole, targets, options.steps[-1])
         now = _with_refitted_radii(now, targets, options)

@@ -18,7 +18,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.distance import exact_distance
 from gcar_deploy.tree.edit import UNTOLD
-from gcar_deploy.tree.facing import FreeEnd, joined_ends
+from gcar_deploy.tree.facing import LEAST_PART_MM, FreeEnd, joined_ends
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Image, Points
 
@@ -28,15 +28,19 @@ MOST_GAP_MM = 10.0
 OFF_MM = 1.5
 #: a lumen thinner than a pixel comes and goes: a shorter break of a picture's vessel is none, mm
 BREAK_MM = 2.0
+#: a fitted branch is long enough to point somewhere, mm
+LEAST_FITTED_MM = 2.0
 
 
-def joined_in_pictures(tree: Tree, views: Sequence[VesselImage]) -> Tree:
+def joined_in_pictures(tree: Tree, views: Sequence[VesselImage], *, fitted: bool = False) -> Tree:
     """Join ends that face each other where every view shows vessel all the way between.
 
     Parameters
     ----------
-    tree : Tree as built of points, mm
+    tree : Tree, mm
     views : sequence of VesselImage
+    fitted : of points, short branches point anywhere; a fitted one may lie between a fork and a
+        lesion behind it
 
     Returns
     -------
@@ -57,7 +61,8 @@ def joined_in_pictures(tree: Tree, views: Sequence[VesselImage]) -> Tree:
             start=a.node, end=b.node,
         )  # fmt: skip
 
-    return joined_ends(tree, bridge, MOST_GAP_MM)
+    least_mm = LEAST_FITTED_MM if fitted else LEAST_PART_MM
+    return joined_ends(tree, bridge, MOST_GAP_MM, least_mm)
 
 
 def _runs_on(line: Points, carm: CArm, beside: Image) -> bool:

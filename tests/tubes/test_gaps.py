@@ -102,13 +102,14 @@ def test_a_lesion_just_behind_a_fork_is_bridged_and_a_scrap_is_not():
         ),
     )
     assert stub.branches[1].length_mm < 5.0
-    tree = joined_in_pictures(stub, seen(whole, two_views()))
-    assert len(stub.part_lengths_mm()) == 2 and len(tree.part_lengths_mm()) == 1
+    views = seen(whole, two_views())
+    assert joined_in_pictures(stub, views) is stub
+    assert len(joined_in_pictures(stub, views, fitted=True).part_lengths_mm()) == 1
     scrap = Tree(
         nodes_mm=np.stack([*cut.nodes_mm[:2], LINE[66], LINE[76]]),
         branches=(cut.branches[0], branch(LINE[66:77], np.full(11, 1.4), 2, 3)),
     )
-    assert len(joined_in_pictures(scrap, seen(whole, two_views())).part_lengths_mm()) == 2
+    assert joined_in_pictures(scrap, views, fitted=True) is scrap
 
 
 def test_ends_that_the_fit_has_turned_are_asked_again():
