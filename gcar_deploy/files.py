@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
+import hashlib
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 _DIGITS = re.compile(r"(\d+)")
+_BLOCK = 2**20
+#: what files of a folder are called that are the frames of a run
+_FRAMES = (".png", ".tif", ".tiff", ".npy")
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
@@ -31,6 +38,57 @@ def read_bounded(path: str | Path, max_bytes: int) -> bytes:
     ValueError
         The end of a sentence that the caller begins with the file's name.
     """
+    with _opened(path, max_bytes) as (stream, size):
+        # No more than the file holds is asked for: a limit is no reason to allocate.
+        data = stream.read(size + 1)
+    if len(data) > size:
+        raise ValueError("grew while it was read; try again when it is complete")
+    if not data:
+        raise ValueError("is empty; copy or export it again")
+    return data
+
+
+def digest_of(path: Path, max_bytes: int, max_frames: int) -> bytes:
+    """SHA-256 of a file, or of the frames of a folder by name and content.
+
+    Parameters
+    ----------
+    max_bytes : a larger file counts as one that cannot be read, all of which are equal
+    max_frames : no more frames of a folder are read
+    """
+    digest = hashlib.sha256()
+    try:
+        if os.path.isdir(path):
+            for frame in frames_in(path)[:max_frames]:
+                digest.update(os.fsencode(frame.name) + b"\0" + digest_of(frame, max_bytes, 0))
+            return digest.digest()
+        with _opened(path, max_bytes) as (stream, size):
+            # A file that grows meanwhile is not followed.
+            for _ in range(0, size, _BLOCK):
+                digest.update(stream.read(_BLOCK))
+    except (OSError, ValueError):
+        return b"absent"
+    return digest.digest()
+
+
+def frames_in(folder: Path) -> list[Path]:
+    """Return the pictures of a folder in the order of the numbers in their names.
+
+    Raises
+    ------
+    ValueError
+        As ``read_bounded``.
+    """
+    try:
+        files = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError as error:
+        raise ValueError(f"cannot be read ({error.strerror})") from None
+    return sorted((p for p in files if p.suffix.lower() in _FRAMES), key=natural_order)
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path, max_bytes: int) -> Iterator[tuple[IO[bytes], int]]:
+    """Open a regular file that is not too large; yields it with its size."""
     try:
         # O_NONBLOCK: a named pipe must be refused, not waited for.
         handle = os.open(
@@ -51,17 +109,11 @@ def read_bounded(path: str | Path, max_bytes: int) -> bytes:
         os.close(handle)
         raise
     with stream:
-        # No more than the file holds is asked for: a limit is no reason to allocate.
-        data = stream.read(info.st_size + 1) if info.st_size <= max_bytes else b""
-    if info.st_size > max_bytes:
-        raise ValueError(
-            f"is larger than the {_size(max_bytes)} that are read ({_size(info.st_size)})"
-        )
-    if len(data) > info.st_size:
-        raise ValueError("grew while it was read; try again when it is complete")
-    if not data:
-        raise ValueError("is empty; copy or export it again")
-    return data
+        if info.st_size > max_bytes:
+            raise ValueError(
+                f"is larger than the {_size(max_bytes)} that are read ({_size(info.st_size)})"
+            )
+        yield stream, info.st_size
 
 
 def read_text(path: str | Path, max_bytes: int) -> str:

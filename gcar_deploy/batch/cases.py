@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.batch.work import BatchEngine
-from gcar_deploy.config import Landmark
+from gcar_deploy.config import DicomLimits, Landmark
 from gcar_deploy.errors import UsageError
-from gcar_deploy.files import text_of
+from gcar_deploy.files import digest_of, text_of
 from gcar_deploy.inputs.order import Order, check_views, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark
 
@@ -25,6 +25,8 @@ _VIEW = re.compile(r"view([1-9][0-9]?)")
 _MASK = re.compile(r"mask([1-9]|1[0-6])")
 _RESERVED = ("rows", "summary.csv", "summary.html", "batch.json")
 MOST_CASES = 100_000
+#: a run would not read more of a file or folder either
+_LIMITS = DicomLimits()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,10 +42,7 @@ class BatchCase:
         what = {"order": order.to_dict(), "engine": dataclasses.asdict(engine)}
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode())
         for name, path in {**self.order.files, **engine.files}.items():
-            try:
-                content = hashlib.sha256(path.read_bytes()).digest()
-            except OSError:
-                content = b"absent"
+            content = digest_of(path, _LIMITS.max_bytes, _LIMITS.max_frames)
             digest.update(name.encode() + b"\0" + content)
         return digest.hexdigest()
 

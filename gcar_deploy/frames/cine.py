@@ -16,11 +16,9 @@ from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import Header, is_dicom, read_header
 from gcar_deploy.dicom.shutter import open_field
 from gcar_deploy.errors import ImageError
-from gcar_deploy.files import natural_order
+from gcar_deploy.files import frames_in
 from gcar_deploy.imaging.read import is_stack, read_picture, read_stack
 from gcar_deploy.types import Image, Mask
-
-_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,12 +127,11 @@ def _of_dicom(path: Path, options: RunOptions) -> Cine | None:
 def _of_folder(path: Path, options: RunOptions, subtracted: bool) -> Cine:
     """Open the pictures of a folder in the order of the numbers in their names."""
     try:
-        files = [p for p in path.iterdir() if not p.name.startswith(".")]
-    except OSError as error:
-        raise ImageError(f"{path.name}: cannot be read ({error.strerror})") from None
-    pictures = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=natural_order)
+        pictures = frames_in(path)
+    except ValueError as error:
+        raise ImageError(f"{path.name}: {error}") from None
     limits = options.dicom.limits
-    if not pictures and any(map(is_dicom, files)):
+    if not pictures and any(map(is_dicom, path.iterdir())):
         raise ImageError(f"{path.name}: the folder holds DICOM files; name the run's file itself")
     if not pictures:
         raise ImageError(f"{path.name}: the folder holds no picture (.png, .tif, .npy)")

@@ -131,6 +131,48 @@ def test_a_model_file_that_changed_is_another_engine(table, tmp_path, monkeypatc
         run_batch([case], tmp_path / "out", engine)
 
 
+def folder_case(tmp_path):
+    """A case whose first view is a folder of frames, given as it lies on the disk now."""
+    folder = tmp_path / "frames"
+    folder.mkdir(exist_ok=True)
+    path = tmp_path / "folder.csv"
+    path.write_text("case,geom,view1,view2\na,g.json,frames,b.png\n")
+    return read_cases(path)[0], folder
+
+
+def test_a_frame_that_changed_in_a_folder_is_noticed(tmp_path):
+    case, folder = folder_case(tmp_path)
+    seen = {case.fingerprint(ENGINE)}
+    for change in (
+        lambda: (folder / "1.png").write_bytes(b"first"),
+        lambda: (folder / "1.png").write_bytes(b"other"),
+        lambda: (folder / "1.png").rename(folder / "2.png"),
+        lambda: (folder / "3.tif").write_bytes(b"first"),
+    ):
+        change()
+        before = len(seen)
+        seen.add(case.fingerprint(ENGINE))
+        assert len(seen) == before + 1
+    # No run reads these.
+    (folder / "notes.txt").write_text("x")
+    (folder / ".hidden.png").write_text("x")
+    assert case.fingerprint(ENGINE) in seen
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes")
+def test_pipes_and_devices_are_not_read(tmp_path):
+    case, folder = folder_case(tmp_path)
+    (folder / "1.png").write_bytes(b"x")
+    before = case.fingerprint(ENGINE)
+    os.mkfifo(folder / "2.png")
+    assert case.fingerprint(ENGINE) != before
+    os.mkfifo(tmp_path / "b.png")
+    piped = case.fingerprint(ENGINE)
+    (tmp_path / "b.png").unlink()
+    (tmp_path / "b.png").symlink_to("/dev/zero")
+    assert case.fingerprint(ENGINE) == piped
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
