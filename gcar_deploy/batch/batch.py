@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gcar_deploy.batch.cases import BatchCase
+from gcar_deploy.batch.lock import only_batch
 from gcar_deploy.batch.pools import Pool, in_processes, on_dask
 from gcar_deploy.batch.summary import write_summary
 from gcar_deploy.batch.work import BatchEngine, BatchJob
 from gcar_deploy.errors import UsageError
 
 SCHEMA = "gcar-batch/1"
+#: statuses of cases that have a result folder
+_WITH_RESULT = ("ok", "degraded")
 #: called with (cases done, cases in all, name of the last)
 OnCase = Callable[[int, int, str], None]
 
@@ -47,9 +51,35 @@ def run_batch(
     Raises
     ------
     UsageError
-        ``out`` holds something else, or a case changed and ``force`` was not given.
+        ``out`` holds something else, another batch is at work in it, or a case changed and
+        ``force`` was not given.
     """
     rows_folder = _own(out)
+    with only_batch(out, rows_folder / "batch.lock"):
+        for left in rows_folder.glob("*.running"):
+            left.unlink(missing_ok=True)
+        rows, missing = _known(cases, out, rows_folder, engine, pool, force=force)
+        if on_case is not None:
+            on_case(len(rows), len(cases), "")
+        try:
+            with contextlib.closing(_done(missing, pool)) as fresh:
+                for row in fresh:
+                    _write_row(rows_folder / f"{row['case']}.json", row)
+                    rows[row["case"]] = row
+                    if on_case is not None:
+                        on_case(len(rows), len(cases), row["case"])
+        finally:
+            # After an interrupt too: what is done is told.
+            ordered = [rows[case.name] for case in cases if case.name in rows]
+            write_summary(ordered, out, of=len(cases))
+    return ordered
+
+
+def _known(
+    cases: Sequence[BatchCase], out: Path, rows_folder: Path, engine: BatchEngine, pool: Pool, *,
+    force: bool,
+) -> tuple[dict[str, dict[str, Any]], list[BatchJob]]:  # fmt: skip
+    """Return the rows that still hold, and the jobs that are left."""
     rows: dict[str, dict[str, Any]] = {}
     missing: list[BatchJob] = []
     for case in cases:
@@ -60,10 +90,12 @@ def run_batch(
                 f"case {case.name!r}: its files or options changed since it was done in {out}; "
                 "choose another folder or add --force"
             )
-        failed = row is not None and row["status"] == "failed"
-        if row is not None and row["fingerprint"] == fingerprint and not (force and failed):
-            rows[case.name] = row
-            continue
+        if row is not None and row["fingerprint"] == fingerprint:
+            # A result that somebody took away is made again.
+            kept = row["status"] not in _WITH_RESULT or (out / case.name / "result.json").is_file()
+            if kept and not (force and row["status"] == "failed"):
+                rows[case.name] = row
+                continue
         # The workers of a cluster have working folders of their own.
         order = dataclasses.replace(case.order, out=out / case.name).relative_to(Path.cwd())
         marker = str((rows_folder / f"{case.name}.running").absolute())
@@ -73,16 +105,7 @@ def run_batch(
                 marker=marker if pool.scheduler is None else None,
             )
         )  # fmt: skip
-    if on_case is not None:
-        on_case(len(rows), len(cases), "")
-    for row in _done(missing, pool):
-        _write_row(rows_folder / f"{row['case']}.json", row)
-        rows[row["case"]] = row
-        if on_case is not None:
-            on_case(len(rows), len(cases), row["case"])
-    ordered = [rows[case.name] for case in cases]
-    write_summary(ordered, out)
-    return ordered
+    return rows, missing
 
 
 def _own(out: Path) -> Path:
@@ -96,17 +119,14 @@ def _own(out: Path) -> Path:
         mark.write_text(json.dumps({"schema": SCHEMA}) + "\n", encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{out} cannot be made ({error.strerror})") from None
-    for left in rows.glob("*.running"):
-        left.unlink(missing_ok=True)
     return rows
 
 
-def _done(jobs: Sequence[BatchJob], pool: Pool) -> Iterator[dict[str, Any]]:
-    if not jobs:
-        return iter(())
-    if pool.scheduler is not None:
-        return on_dask(jobs, pool.scheduler)
-    return in_processes(jobs, pool.processes)
+def _done(jobs: Sequence[BatchJob], pool: Pool) -> Generator[dict[str, Any], None, None]:
+    if jobs and pool.scheduler is not None:
+        yield from on_dask(jobs, pool.scheduler)
+    elif jobs:
+        yield from in_processes(jobs, pool.processes)
 
 
 def _read_row(path: Path) -> dict[str, Any] | None:

@@ -23,7 +23,8 @@ from gcar_deploy.inputs.words import parse_frames, parse_landmark
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _VIEW = re.compile(r"view([1-9][0-9]?)")
 _MASK = re.compile(r"mask([1-9]|1[0-6])")
-_RESERVED = ("rows", "summary.csv", "summary.html", "batch.json")
+#: what a batch itself puts beside its cases
+_RESERVED = re.compile(r"rows|batch\.json|summary\.(csv|html)(\.partial)?", re.IGNORECASE)
 MOST_CASES = 100_000
 #: a run would not read more of a file or folder either
 _LIMITS = DicomLimits()
@@ -96,6 +97,9 @@ def _view_columns(table: Path, names: Any) -> list[str]:
             raise UsageError(f"{table.name}: column {name!r} is missing")
     if views[:2] != ["view1", "view2"]:
         raise UsageError(f"{table.name}: columns 'view1' and 'view2' are missing")
+    twice = [name for name in names if list(names).count(name) > 1]
+    if twice:
+        raise UsageError(f"{table.name}: column {twice[0]!r} stands there twice")
     unknown = {name for name in names if not _MASK.fullmatch(name)}
     unknown -= {"case", "geom", "order", *views, *COLUMNS}
     if unknown:
@@ -111,10 +115,12 @@ def _case(
         raise UsageError(f"{where}: more fields than columns")
     told = {name: (text or "").strip() for name, text in line.items()}
     name = told["case"]
-    if not _NAME.fullmatch(name) or name.lower() in _RESERVED:
+    if not _NAME.fullmatch(name):
         raise UsageError(
             f"{where}: case {name!r} must be letters, digits, '.', '_' or '-' (it names a folder)"
         )
+    if _RESERVED.fullmatch(name):
+        raise UsageError(f"{where}: case {name!r} has the name of a file of the batch itself")
     cells = [told[column] for column in columns]
     while cells and not cells[-1]:
         cells.pop()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import multiprocessing
-from collections.abc import Iterator, Sequence
+import signal
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -30,15 +32,16 @@ def in_processes(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str,
 
     A process that dies (out of memory, a crash in a library) takes its pool along: the cases
     that were running are then run alone, one by one, and the one that kills its process again
-    gets a row that says so.
+    gets a row that says so. An interrupt ends what runs; rows that are done come before it goes on.
     """
     waiting = list(jobs)
     while waiting:
         finished: set[str] = set()
         try:
-            for row in _pool(waiting, processes):
-                finished.add(row["case"])
-                yield row
+            with contextlib.closing(_pool(waiting, processes)) as rows:
+                for row in rows:
+                    finished.add(row["case"])
+                    yield row
         except BrokenProcessPool:
             suspects = [
                 job
@@ -52,27 +55,60 @@ def in_processes(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str,
         waiting = [job for job in waiting if job.case not in finished]
 
 
-def _pool(jobs: Sequence[BatchJob], processes: int) -> Iterator[dict[str, Any]]:
+def _pool(jobs: Sequence[BatchJob], processes: int) -> Generator[dict[str, Any], None, None]:
     # Spawned, not forked: numerical libraries keep threads that do not survive a fork.
-    with concurrent.futures.ProcessPoolExecutor(
+    spawn = multiprocessing.get_context("spawn")
+    # Without a lock: a process that dies may hold one.
+    end = spawn.RawValue("b", 0)
+    others = set(multiprocessing.active_children())
+    pool = concurrent.futures.ProcessPoolExecutor(
         min(processes, len(jobs)),
-        mp_context=multiprocessing.get_context("spawn"),
+        mp_context=spawn,
         initializer=prepare_process,
-        initargs=(jobs[0].engine.threads,),
-    ) as pool:
+        initargs=(jobs[0].engine.threads, end),
+    )
+    waiting: set[concurrent.futures.Future[dict[str, Any]]] = set()
+    try:
+        with _without_interrupts():
+            waiting.update(pool.submit(run_case, job) for job in jobs)
+        for future in concurrent.futures.as_completed(list(waiting)):
+            row = future.result()
+            waiting.remove(future)
+            yield row
+    except BaseException as error:
+        end.value = 1
         try:
-            for future in concurrent.futures.as_completed(
-                [pool.submit(run_case, job) for job in jobs]
-            ):
-                yield future.result()
+            pool.shutdown(cancel_futures=True)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # Asked again: without manners.
+            for process in set(multiprocessing.active_children()) - others:
+                process.kill()
             raise
+        if not isinstance(error, GeneratorExit):
+            for future in waiting:
+                if not future.cancelled() and future.exception() is None:
+                    yield future.result()
+        raise
+    pool.shutdown()
+
+
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Start processes that an interrupt from the terminal does not reach; it comes afterwards."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _alone(job: BatchJob) -> dict[str, Any]:
     try:
-        return next(_pool([job], 1))
+        with contextlib.closing(_pool([job], 1)) as rows:
+            return next(rows)
     except BrokenProcessPool:
         if job.marker is not None:
             Path(job.marker).unlink(missing_ok=True)

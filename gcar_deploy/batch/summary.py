@@ -33,9 +33,14 @@ _FACTORS = {"least_coverage": 100.0}
 _THUMBNAILS, _THUMBNAIL_PX = 2, 96
 
 
-def write_summary(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
-    """Write both files; an earlier summary of the same batch is replaced."""
-    page = summary_html(rows, out)
+def write_summary(rows: Sequence[Mapping[str, Any]], out: Path, *, of: int | None = None) -> None:
+    """Write both files; an earlier summary of the same batch is replaced.
+
+    Parameters
+    ----------
+    of : cases in all, where some have no row yet
+    """
+    page = summary_html(rows, out, of=of)
     for name, text in (("summary.csv", summary_csv(rows)), ("summary.html", page)):
         partial = out / f"{name}.partial"
         partial.write_text(text, encoding="utf-8", newline="")
@@ -52,13 +57,14 @@ def summary_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def summary_html(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
+def summary_html(rows: Sequence[Mapping[str, Any]], out: Path, *, of: int | None = None) -> str:
     """One page with a line a case, linked to its report; sorted and filtered by the page itself.
 
     Parameters
     ----------
     rows : one a case
     out : folder of the batch, whose cases' overlays are shown small
+    of : as ``write_summary``
 
     Returns
     -------
@@ -67,8 +73,9 @@ def summary_html(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
     template = resources.files("gcar_deploy.batch").joinpath(_TEMPLATE).read_text("utf-8")
     counts = Counter(str(row["status"]) for row in rows)
     said = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
+    count = f"{len(rows)} cases" if of in (None, len(rows)) else f"{len(rows)} of {of} cases"
     parts = {
-        "TITLE": html.escape(f"{len(rows)} cases: {said}" if rows else "no cases"),
+        "TITLE": html.escape(f"{count}: {said}" if rows else "no cases"),
         "HEAD": _head("Case", "", "words") + "<th><span>Views</span></th>"
         + "".join(
             _head(name, unit, "words" if digits is None else "") for _, name, unit, digits in _SHOWN

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import multiprocessing
+import os
 import signal
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.errors import GcarError, RefusedError
+from gcar_deploy.errors import CancelledError, GcarError, RefusedError
 from gcar_deploy.inputs.order import Order
 
 #: columns of summary.csv, in order
@@ -17,6 +21,8 @@ COLUMNS = (
     "case", "status", "exit_code", "sentence", "branches", "length_mm", "gaussians",
     "separation_deg", "least_coverage", "largest_stenosis_percent", "seconds",
 )  # fmt: skip
+#: in a process that does cases: whether the batch is to end
+_ENDING: ContextVar[Callable[[], bool] | None] = ContextVar("gcar_batch_ending", default=None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +61,14 @@ class BatchJob:
 
 
 def run_case(job: BatchJob) -> dict[str, Any]:
-    """Reconstruct one case and write its folder; errors are rows, not exceptions."""
+    """Reconstruct one case and write its folder; errors are rows, not exceptions.
+
+    Raises
+    ------
+    CancelledError
+        The batch ends: the case is as good as never begun.
+    """
+    _check_wanted()
     marker = None if job.marker is None else Path(job.marker)
     if marker is not None:
         marker.touch()
@@ -73,13 +86,28 @@ def error_row(case: str, status: str, sentence: str, exit_code: int) -> dict[str
     return row
 
 
-def prepare_process(threads: int | None) -> None:
-    """Set up a process that does cases: interrupts belong to its parent, threads are few."""
+def prepare_process(threads: int | None, end: Any) -> None:
+    """Set up a process that does cases: interrupts belong to its parent, threads are few.
+
+    Parameters
+    ----------
+    end : its ``value`` is true once the parent wants it to end
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _ENDING.set(lambda: bool(end.value))
+    threading.Thread(target=_die_with_parent, daemon=True).start()
     if threads is not None:
         import cv2
 
         cv2.setNumThreads(threads)
+
+
+def _die_with_parent() -> None:
+    """End this process when its parent was killed: nobody takes its row any more."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @functools.lru_cache(maxsize=2)
@@ -96,6 +124,12 @@ def _engine(engine: BatchEngine, predictor: str | None) -> Any:
     )
 
 
+def _check_wanted() -> None:
+    ending = _ENDING.get()
+    if ending is not None and ending():
+        raise CancelledError("the batch ends")
+
+
 def _solved(job: BatchJob) -> dict[str, Any]:
     try:
         engine = _engine(job.engine, job.order.predictor)
@@ -106,9 +140,12 @@ def _solved(job: BatchJob) -> dict[str, Any]:
         left = out is not None and (out / "result.json").is_file()
         order = dataclasses.replace(job.order, force=left)
         check_target_of(order)
-        result = engine.reconstruct_order(order)
+        result = engine.reconstruct_order(order, cancel=_ENDING.get())
         deliver(result, order)
         return _row(job.case, result.summary())
+    except CancelledError as error:
+        _check_wanted()
+        return error_row(job.case, "failed", str(error), error.exit_code)
     except RefusedError as error:
         return error_row(job.case, "refused", str(error), error.exit_code)
     except GcarError as error:

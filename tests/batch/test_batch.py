@@ -5,7 +5,11 @@ from __future__ import annotations
 import csv
 import html.parser
 import json
+import multiprocessing
 import os
+import signal
+import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -19,7 +23,7 @@ from gcar_deploy.batch.summary import summary_csv, summary_html
 from gcar_deploy.batch.work import BatchEngine
 from gcar_deploy.errors import UsageError
 from gcar_deploy.inputs.order import Order
-from tests.batch.dying import suicidal
+from tests.batch.dying import patient, suicidal
 from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
 
 ENGINE = BatchEngine(threads=1)
@@ -89,7 +93,10 @@ def test_an_interrupted_batch_goes_on(table, tmp_path, monkeypatch):
     first = rows_without_processes(monkeypatch, kill=("missing",))
     with pytest.raises(KeyboardInterrupt):
         run_batch(cases, out, ENGINE)
-    assert first == ["good-1", "twice"] and not (out / "summary.csv").exists()
+    assert first == ["good-1", "twice"]
+    told = [line.split(",")[0] for line in (out / "summary.csv").read_text().splitlines()]
+    assert told == ["case", "good-1", "twice"]
+    assert "2 of 6 cases: " in (out / "summary.html").read_text()
     second = rows_without_processes(monkeypatch)
     told = []
     rows = run_batch(cases, out, ENGINE, on_case=lambda *what: told.append(what[:2]))
@@ -191,6 +198,98 @@ def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
     assert "died" in rows["killer"]["sentence"]
 
 
+def rows_of_interrupted(tmp_path, monkeypatch, *, times):
+    """Interrupt a pool of one process once its second case runs; return rows and seconds."""
+    monkeypatch.setattr(pools, "run_case", patient)
+    names = ("a", "b", "c", "d")
+    jobs = [
+        work.BatchJob(
+            case=name, order=Order(), engine=BatchEngine(), marker=str(tmp_path / name),
+            fingerprint="stubborn" if times > 1 else "f",
+        )
+        for name in names
+    ]  # fmt: skip
+    begun = []
+
+    def interrupt():
+        while not (tmp_path / "b").exists():
+            time.sleep(0.01)
+        begun.append(time.monotonic())
+        for _ in range(times):
+            time.sleep(0.3)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sender = threading.Thread(target=interrupt)
+    sender.start()
+    rows = []
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            rows.extend(row["case"] for row in pools.in_processes(jobs, 1))
+    finally:
+        sender.join()
+        signal.signal(signal.SIGINT, handler)
+    begun_cases = [name for name in names if (tmp_path / f"{name}.begun").exists()]
+    return begun_cases, time.monotonic() - begun[0]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_interrupt_ends_the_cases_and_begins_none(tmp_path, monkeypatch, times):
+    begun, seconds = rows_of_interrupted(tmp_path, monkeypatch, times=times)
+    assert begun == ["a", "b"] and seconds < 20
+    end = time.monotonic() + 20
+    while multiprocessing.active_children():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_a_second_batch_in_a_folder_is_refused_in_one_line(table, tmp_path, monkeypatch):
+    (case,) = (case for case in read_cases(table) if case.name == "missing")
+    out, refused = tmp_path / "out", []
+
+    def meanwhile(jobs, processes):
+        for job in jobs:
+            Path(job.marker).touch()
+            with pytest.raises(
+                UsageError, match=rf"process {os.getpid()}\) is at work in"
+            ) as caught:
+                run_batch([case], out, ENGINE)
+            refused.append(str(caught.value))
+            # Nothing of the first is taken for what a dead one left.
+            assert Path(job.marker).exists()
+            yield work.run_case(job)
+
+    monkeypatch.setattr("gcar_deploy.batch.batch.in_processes", meanwhile)
+    rows = run_batch([case], out, ENGINE)
+    assert len(refused) == 1 and rows[0]["exit_code"] == 3
+    # Over, or dead: the folder is free again.
+    (out / "rows" / "batch.lock").write_text("4194304\n")
+    assert run_batch([case], out, ENGINE) == rows
+
+
+def test_a_result_that_was_taken_away_is_made_again(table, tmp_path, monkeypatch):
+    (case,) = (case for case in read_cases(table) if case.name == "good-1")
+    out, ran = tmp_path / "out", []
+
+    def made(jobs, processes):
+        for job in jobs:
+            ran.append(job.case)
+            (out / job.case).mkdir(exist_ok=True)
+            (out / job.case / "result.json").write_text("{}")
+            yield {**work.error_row(job.case, "ok", "", 0), "fingerprint": job.fingerprint}
+
+    monkeypatch.setattr("gcar_deploy.batch.batch.in_processes", made)
+    for _ in range(2):
+        run_batch([case], out, ENGINE)
+    assert ran == ["good-1"]
+    (out / "good-1" / "result.json").unlink()
+    (out / "good-1").rmdir()
+    run_batch([case], out, ENGINE)
+    assert ran == ["good-1", "good-1"]
+
+
 @pytest.mark.slow
 def test_on_a_dask_cluster(table, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
@@ -231,6 +330,9 @@ def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
         ("case,geom,view1,view2\n../a,g,1,2\n", "line 2: case '../a'"),
         ("case,geom,view1,view2\nrows,g,1,2\n", "'rows'"),
         ("case,geom,view1,view2\na,g,1,2\nA,g,1,2\n", "line 3: case 'A' stands there twice"),
+        ("case,geom,view1,view2\nSummary.csv.partial,g,1,2\n", "file of the batch itself"),
+        ("case,geom,view1,view2\nbatch.json,g,1,2\n", "file of the batch itself"),
+        ("case,geom,view1,view2,view2\na,g,1,2,3\n", "column 'view2' stands there twice"),
         ("case,geom,view1,view2\na,g,1,\n", "two or more views"),
         ("case,geom,view1,view2,view3\na,g,1,,3\n", "without a gap"),
     ],
