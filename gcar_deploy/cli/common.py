@@ -218,11 +218,12 @@ def until_stopped() -> Iterator[None]:
 
 
 def serve_until_stopped(server: Any) -> None:
-    """Run a server of ``worker.loopback`` until Ctrl-C; its port is free afterwards."""
-    try:
-        with until_stopped():
-            server.run()
-    finally:
+    """Run a server of ``worker.loopback`` until Ctrl-C; its port is free afterwards.
+
+    Asked twice, it leaves the port to the end of the process: requests may still be answered.
+    """
+    with until_stopped():
+        server.run()
         server.close()
 
 

@@ -69,7 +69,7 @@ def open_(order: Order, no_browser: bool, port: int, engine: EngineChoice, talk:
     queue = JobQueue(functools.partial(desk.work, warm))
     try:
         token = secrets.token_urlsafe(32)
-        server = listen(create_app(desk, queue, token, first), port)
+        server = listen(create_app(desk, queue, token, first), port, queue.close)
         host = f"http://{LOOPBACK}:{server.effective_port}"
         address = f"{host}/files/{shelved}/report.html" if shelved else f"{host}/#{token}"
         click.echo(address)

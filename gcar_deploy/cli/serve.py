@@ -115,7 +115,7 @@ def serve(door: Door, limits: Limits, order: Order, engine: EngineChoice, talk: 
     from gcar_deploy.worker.folder import AllowedFolder
     from gcar_deploy.worker.jobs import JobQueue
     from gcar_deploy.worker.orders import do_order
-    from gcar_deploy.worker.scratch import sweep_scratch
+    from gcar_deploy.worker.scratch import drop_all_scratch, sweep_scratch
 
     allowed = None if door.folder is None else AllowedFolder(door.folder)
     # Only what will serve changes its process: a refused call leaves it as it was.
@@ -132,10 +132,14 @@ def serve(door: Door, limits: Limits, order: Order, engine: EngineChoice, talk: 
     def make_queue(on_change: Any = None) -> JobQueue:
         return JobQueue(work, most_waiting=limits.waiting, on_change=on_change)
 
-    if door.stdio:
-        _serve_lines(make_queue, allowed)
-    else:
-        _serve_http(make_queue(), allowed, token, door.port, limits.body_mib)
+    try:
+        if door.stdio:
+            _serve_lines(make_queue, allowed)
+        else:
+            _serve_http(make_queue(), allowed, token, door.port, limits.body_mib)
+    finally:
+        # Told twice to stop, it waits for no job; copies of pictures are not left for all that.
+        drop_all_scratch()
 
 
 def _serve_lines(make_queue: Any, allowed: Any) -> None:
@@ -161,7 +165,8 @@ def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib
 
         fresh = token is None
         token = token or secrets.token_urlsafe(32)
-        server = listen(create_app(queue, token, folder=allowed, body_mib=body_mib), port)
+        app = create_app(queue, token, folder=allowed, body_mib=body_mib)
+        server = listen(app, port, queue.close)
         click.echo(f"gcar: http://{LOOPBACK}:{server.effective_port}", err=True)
         if fresh:
             click.echo(f"gcar: token {token}", err=True)

@@ -153,14 +153,15 @@ class JobQueue:
         job.received.clean()
 
     def close(self) -> None:
-        """Cancel everything and wait for the working thread."""
+        """Cancel everything and wait for the working thread; called again, it does not wait."""
         with self._changed:
-            self._closing = True
+            again, self._closing = self._closing, True
             jobs = list(self._jobs.values())
             self._changed.notify_all()
         for job in jobs:
             self.cancel(job)
-        self._thread.join()
+        if not again:
+            self._thread.join()
         for job in jobs:
             self.forget(job)
 

@@ -23,6 +23,12 @@ def drop_scratch(folder: Path) -> None:
     drop(folder, _held.pop(folder, None))
 
 
+def drop_all_scratch() -> None:
+    """Remove every folder of this process, also those of jobs that still run."""
+    for folder in list(_held):
+        drop_scratch(folder)
+
+
 def sweep_scratch() -> int:
     """Remove the folders of workers that were killed; return how many."""
     return sweep(Path(tempfile.gettempdir()), WORKER)

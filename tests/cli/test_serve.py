@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
+import time
 import urllib.request
 
 import pytest
 
 from gcar_deploy.cli.serve import read_token
 from gcar_deploy.errors import UsageError
-from tests.cli.conftest import gcar
+from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
 
 pytest.importorskip("flask")
 
@@ -42,6 +45,46 @@ def test_serves_until_it_is_told_to_stop(number):
     worker.send_signal(number)
     out, err = worker.communicate(timeout=300)
     assert worker.returncode == 0 and out == "" and token[1] not in err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("times", [1, 2])
+def test_told_to_stop_while_clients_wait_it_leaves_no_picture(good_case, tmp_path, times):  # noqa: F811
+    private = tmp_path / "private"
+    private.mkdir()
+    worker = subprocess.Popen(
+        [sys.executable, "-m", "gcar_deploy.cli.main", "serve", "--predictor", "none",
+         "--folder", str(good_case)],
+        stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "GCAR_TOKEN": "0123456789abcdef", "TMPDIR": str(private)},
+    )  # fmt: skip
+    assert worker.stderr
+    address = worker.stderr.readline().split()[1]
+    order = {"views": ["view1.png", "view2.png"], "geometry": "geom.json"}
+
+    def ask():
+        request = urllib.request.Request(
+            f"{address}/v1/reconstruct?wait=60", json.dumps(order).encode(),
+            {"Authorization": "Bearer 0123456789abcdef", "Content-Type": "application/json"},
+        )  # fmt: skip
+        with contextlib.suppress(OSError), urllib.request.urlopen(request, timeout=120) as reply:
+            reply.read()
+
+    clients = [threading.Thread(target=ask) for _ in range(8)]
+    for client in clients:
+        client.start()
+    end = time.monotonic() + 60
+    while len(list(private.iterdir())) < len(clients):
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    for _ in range(times):
+        worker.send_signal(signal.SIGTERM)
+        time.sleep(0.02)
+    _, err = worker.communicate(timeout=300)
+    for client in clients:
+        client.join()
+    assert "Traceback" not in err and "descriptor" not in err and not list(private.iterdir()), err
 
 
 def test_tokens_from_the_environment_and_files(tmp_path, monkeypatch):

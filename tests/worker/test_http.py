@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import http.client
 import json
 import os
+import socket
 import time
 from importlib import resources
 from pathlib import Path
@@ -327,3 +330,65 @@ def test_a_job_is_what_the_document_says(serving):
     job = ask("POST", "/v1/reconstruct?wait=60", ORDER).json()
     schema = {"$ref": "#/components/schemas/Job", "components": document["components"]}
     jsonschema.validate(job, schema)
+
+
+def slowly(port, header, *, seconds, wait_s=0.2):
+    """Send a request's header, then a byte now and then; return when the worker hung up."""
+    start = time.monotonic()
+    with socket.create_connection(("127.0.0.1", port), 10) as link:
+        link.sendall(header)
+        link.settimeout(wait_s)
+        while time.monotonic() - start < seconds:
+            try:
+                link.sendall(b"x")
+                if not link.recv(1):
+                    return time.monotonic() - start
+            except TimeoutError:
+                continue
+            except OSError:
+                return time.monotonic() - start
+    return None
+
+
+def test_a_stranger_that_drips_is_hung_up_on_and_who_bears_the_token_is_not(serving, monkeypatch):
+    ask, _ = serving
+    monkeypatch.setattr("gcar_deploy.worker.loopback._STRANGERS_S", 1.0)
+    head = b"POST /v1/reconstruct HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n"
+    bearer = f"Authorization: Bearer {TOKEN}\r\n".encode()
+    for strange in (b"POST / HTTP/1.1\r\nX: ", head + b"\r\n"):
+        hung_up = slowly(ask.port, strange, seconds=20)
+        assert hung_up is not None and hung_up > 0.9
+    assert slowly(ask.port, head + bearer + b"\r\n", seconds=4) is None
+
+
+def test_more_slow_strangers_than_threads_hold_nothing_up(serving):
+    ask, _ = serving
+    head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 1000\r\n\r\n"
+    with contextlib.ExitStack() as links:
+        for _ in range(80):
+            link = socket.create_connection(("127.0.0.1", ask.port), 10)
+            links.enter_context(link).sendall(head)
+        start = time.monotonic()
+        assert ask("GET", "/health").status == 200 and time.monotonic() - start < 5
+
+
+def test_of_a_stranger_no_body_is_kept_and_it_reads_why(serving, monkeypatch):
+    from waitress.buffers import OverflowableBuffer
+
+    ask, _ = serving
+    kept = []
+    append = OverflowableBuffer.append
+    monkeypatch.setattr(
+        OverflowableBuffer, "append", lambda self, data: (kept.append(data), append(self, data))[1]
+    )
+    body = b"picture " * 2**16
+    stranger = dataclasses.replace(ask, token=TOKEN[:-1])
+    assert stranger("POST", "/v1/reconstruct", body).status == 401
+    link = http.client.HTTPConnection("127.0.0.1", ask.port, timeout=60)
+    link.request("POST", "/v1/reconstruct", iter([body]), encode_chunked=True,
+                 headers={"Transfer-Encoding": "chunked"})  # fmt: skip
+    assert link.getresponse().status == 401
+    link.close()
+    assert b"picture" not in b"".join(kept)
+    assert ask("POST", "/v1/reconstruct", body, Content_Type="application/json").status == 400
+    assert b"picture" in b"".join(kept)
