@@ -120,10 +120,13 @@ def _thumbnails(folder: Path) -> str:
     """Return small overlays of a result folder, as part of the page; nothing where it is gone."""
     import cv2
 
+    from gcar_deploy.imaging.read import quiet_decoder
+
     found = []
     for k in range(1, _THUMBNAILS + 1):
         # Decoded at a quarter of the size: a page of many cases is made in a moment.
-        picture = cv2.imread(str(folder / f"overlay_view{k}.png"), cv2.IMREAD_REDUCED_COLOR_4)
+        with quiet_decoder():
+            picture = cv2.imread(str(folder / f"overlay_view{k}.png"), cv2.IMREAD_REDUCED_COLOR_4)
         if picture is None:
             continue
         scale = _THUMBNAIL_PX / picture.shape[0]

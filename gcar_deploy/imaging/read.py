@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import logging
+import threading
 import tokenize
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -18,6 +21,8 @@ from gcar_deploy.imaging import png_guard
 from gcar_deploy.types import Array, Image
 
 _log = logging.getLogger(__name__)
+#: the level of OpenCV's messages is one for all threads
+_ONE_DECODER = threading.Lock()
 _NPY_SIGNATURE = b"\x93NUMPY"
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
 #: what else a hostile header can raise
@@ -110,7 +115,8 @@ def read_stack(
         if rows * columns * count > limits.max_pixels:
             raise ValueError(f"holds {count} pages of {columns} x {rows} pixels, which is too much")
         try:
-            done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            with quiet_decoder(unless=depth == 8):
+                done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             done, pages = False, ()
         if not done or len(pages) != count or any(p.dtype != _TYPE_OF[depth] for p in pages):
@@ -124,6 +130,20 @@ def read_stack(
     except ValueError as error:
         raise ImageError(f"{path.name}: {error}") from None
     return [page.astype(np.float32) for page in grey], depth, hashlib.sha256(data).hexdigest()
+
+
+@contextlib.contextmanager
+def quiet_decoder(*, unless: bool = False) -> Iterator[None]:
+    """Keep OpenCV from writing to stderr what a damaged file is told of by an error."""
+    if unless:
+        yield
+        return
+    with _ONE_DECODER:
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            yield
+        finally:
+            cv2.utils.logging.setLogLevel(level)
 
 
 def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Array, int]:
@@ -144,7 +164,9 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Array, int
     depth = check(data, limits.min_side, limits.max_side)
     try:
         # UNCHANGED: GRAYSCALE would make 8 bit of 16 and obey an EXIF rotation.
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        # Of 8 bit, OpenCV takes a TIFF that it cannot decode, and its own line is all that tells.
+        with quiet_decoder(unless=found == "TIFF" and depth == 8):
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         picture = None
     if picture is None or picture.dtype != _TYPE_OF[depth]:

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gcar_deploy.config import PictureLimits
+from gcar_deploy.config import DicomLimits, PictureLimits
 from gcar_deploy.errors import ImageError
-from gcar_deploy.imaging.read import read_picture
+from gcar_deploy.imaging.read import read_picture, read_stack
 from tests.imaging.phantoms import png, png_chunk
 
 _quick = settings(
@@ -188,6 +188,21 @@ def test_bad_files_have_one_clear_line(tmp_path, name):
     assert message.startswith(f"{name}: ") and words in message
     assert "\n" not in message and str(tmp_path) not in message
     assert path.read_bytes() == data and len(list(tmp_path.iterdir())) == 1
+
+
+def test_of_a_damaged_tiff_only_the_error_tells(tmp_path, capfd):
+    level = cv2.utils.logging.getLogLevel()
+    noise = np.random.default_rng(0).integers(0, 65535, (64, 64), np.uint16)
+    for name, encoded, read in (
+        ("a.tif", cv2.imencode(".tif", noise)[1], read_picture),
+        ("b.tif", cv2.imencodemulti(".tif", [noise, noise])[1], read_stack),
+    ):
+        # The first strip lies between the header and the directory.
+        encoded[8 : int(encoded[4:8].view("<u4")[0])] = 255
+        (tmp_path / name).write_bytes(encoded.tobytes())
+        with pytest.raises(ImageError, match="cannot be decoded"):
+            read(tmp_path / name, DicomLimits())
+    assert capfd.readouterr().err == "" and cv2.utils.logging.getLogLevel() == level
 
 
 @pytest.mark.req("REQ-09")
