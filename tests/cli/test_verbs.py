@@ -130,6 +130,9 @@ def test_json_is_one_object_that_is_the_result(good_case, tmp_path):
     done = gcar(*run_arguments(good_case, tmp_path / "out", "--json"))
     assert done.code == 0, done.err
     printed = json.loads(done.out)
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = resources.files("gcar_deploy.output").joinpath("result.schema.json").read_text()
+    jsonschema.validate(printed, json.loads(schema))
     stored = json.loads((tmp_path / "out" / "result.json").read_text())
     assert printed.pop("out") == str(tmp_path / "out")
     stored.pop("files")
