@@ -79,10 +79,12 @@ def _check_existing(out_dir: Path, inputs: tuple[Path, ...]) -> None:
     whole = out_dir.resolve()
     if whole.is_mount():
         raise UsageError(f"{out_dir} is a mount point, which cannot be replaced; name a new folder")
-    for precious, what in (
-        (Path.cwd(), "working folder"), (Path.home(), "home folder"),
-        *((path.resolve(), f"input {path.name}") for path in inputs),
-    ):  # fmt: skip
+    kept = [(path.resolve(), f"input {path.name}") for path in inputs]
+    for where, what in ((Path.cwd, "working folder"), (Path.home, "home folder")):
+        # Deleted, or a user without one.
+        with contextlib.suppress(OSError, RuntimeError):
+            kept.append((where(), what))
+    for precious, what in kept:
         if precious == whole:
             raise UsageError(f"{out_dir} is the {what}, which is not replaced; name a new folder")
         if whole in precious.parents:

@@ -94,6 +94,22 @@ def test_inputs_and_the_working_folder_are_never_taken_along(tmp_path, monkeypat
         check_target(Path("/"), force=force)
 
 
+def test_neither_a_home_nor_a_working_folder_is_needed(tmp_path, monkeypatch):
+    def absent(*_):
+        raise RuntimeError("no home")
+
+    out, gone = tmp_path / "out", tmp_path / "gone"
+    write_folder(out, {"view1.png": b"1"})
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    monkeypatch.setattr(Path, "home", absent)
+    if os.name == "posix":
+        gone.rmdir()
+    check_target(out, force=True)
+    write_folder(out, {"view1.png": b"2"}, force=True)
+    assert (out / "view1.png").read_bytes() == b"2"
+
+
 @pytest.mark.parametrize("force", [False, True])
 @pytest.mark.parametrize(
     "content",
