@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -285,6 +286,11 @@ def _list(key: str, value: Any, of: str) -> list[Any]:
 def _path(key: str, value: Any) -> Path:
     if not isinstance(value, str) or not value or "\0" in value:
         raise UsageError(f"{key} = {quote(value)} must be the name of a file or folder")
+    try:
+        # Half of a pair of surrogates names nothing.
+        os.fsencode(value)
+    except UnicodeEncodeError:
+        raise UsageError(f"{key} = {quote(value)} has characters that no name has") from None
     return Path(value)
 
 
