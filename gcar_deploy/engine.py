@@ -135,10 +135,11 @@ class Engine:
             what would be found in the pixels
         on_progress : called with (stage, share of the work done) from the calling thread
         deadline_s : seconds that the call may take: the refinement ends early enough with what
-            it has (``degraded``); CancelledError if there is nothing to refine by then
-        cancel : callable, for instance ``threading.Event().is_set``; also asked from another
-            thread while the model runs; ends within one frame that is read, or one step of the
-            refinement
+            it has (``degraded``); CancelledError if there is nothing to refine by then, later by
+            what lies between two questions
+        cancel : callable, for instance ``threading.Event().is_set``; asked, as is the deadline,
+            before each frame that is read, each stage, estimate of the pose and step of the
+            refinement, and from another thread while the model runs
         on_step : told what each stage hands on, for instance ``output.steps.StepFolder``
 
         Raises
