@@ -31,7 +31,7 @@ from gcar_deploy.measure import (
 )
 from gcar_deploy.pose import landmark_pixels, marked_places, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
-from gcar_deploy.quality import check_candidates, check_tree, check_views, judge
+from gcar_deploy.quality import Part, Remark, check_candidates, check_tree, check_views, judge
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.steps import OnStep, Step
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
@@ -147,11 +147,11 @@ def _reconstructed(
     # Nothing but the result asks for the voxels: they are made beside what follows.
     made = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
     with watch.stage("quality", keep_if_late=True), placed.hinting():
-        for stage in (vessels, placed, centers, refined):
-            findings += stage.findings
+        findings += [*placed.findings, *centers.findings]
+        findings += map(Part, (*vessels.findings, *refined.findings))
         ostia = marked_places(options.ostia, [view.carm for view in placed.views])
         idle = idle_ostia(refined.tree, ostia)
-        findings += missed + idle
+        findings += map(Remark, missed + idle)
         tree = from_inlets(refined.tree, ostia)
         judged = judge(
             tree, placed.views, findings, options,

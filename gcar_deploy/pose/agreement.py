@@ -19,7 +19,7 @@ from gcar_deploy.pose.landmarks import landmark_pixels
 from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses, worst_of
 from gcar_deploy.pose.partners import GAIN, partnered, shown_share
-from gcar_deploy.quality import check_order, disagreement_limits, kind_of
+from gcar_deploy.quality import Remark, check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
 
@@ -115,7 +115,7 @@ def _changed(now: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[s
                 f"view {one.view_id}: {more / one.mask.sum():.0%} of the vessels look like a "
                 "catheter or lead; they are kept, because the other views show them as well"
             )
-    return said
+    return [Remark(text) for text in said]
 
 
 def _by_width(

@@ -23,6 +23,7 @@ from gcar_deploy.quality.ghosts import (
     ghost_share,
     shipped_model,
 )
+from gcar_deploy.quality.gravity import Part, Remark
 from gcar_deploy.quality.status import (
     Quality,
     ViewQuality,
@@ -38,7 +39,9 @@ __all__ = [
     "PROBABLE",
     "GhostModel",
     "Ghosts",
+    "Part",
     "Quality",
+    "Remark",
     "ViewQuality",
     "check_agreement",
     "check_asked",

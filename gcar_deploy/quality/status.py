@@ -21,6 +21,7 @@ from gcar_deploy.quality.anatomy import check_anatomy
 from gcar_deploy.quality.border import check_border
 from gcar_deploy.quality.gates import best_separation, disagreement_limits, is_cut, kind_of
 from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
+from gcar_deploy.quality.gravity import Part, Remark, gravest_first
 from gcar_deploy.quality.hidden_ends import check_hidden_ends
 from gcar_deploy.quality.human_range import check_human_range
 from gcar_deploy.quality.missing import check_missing
@@ -85,7 +86,7 @@ class Quality:
     ----------
     status : ``ok`` or ``degraded`` (``refused`` and ``failed`` are raised as errors)
     sentence : str
-    findings : every reason for ``degraded``
+    findings : every reason for ``degraded``, the gravest first
     separation_deg : best angle between two views, folded to 0 .. 90
     disagreement : worst epipolar disagreement of any view with the first, or None
     views : one ViewQuality per view
@@ -133,13 +134,16 @@ def judge(
     shown = Shown(tree, views, evidence)
     elsewhere = alternatives.evidence_elsewhere(shown)
     ghosts = find_ghosts(shown)
-    findings = [
-        *findings, *alternatives.findings(open_, elsewhere), *check_scale(tree, views),
-        *check_human_range(tree), *check_ghosts(ghosts, options.quality),
-        *check_anatomy(tree, [view.carm for view in views]), *check_border(tree, views),
+    whole = [
+        *check_scale(tree, views), *check_human_range(tree),
+        *check_anatomy(tree, [view.carm for view in views]),
+    ]  # fmt: skip
+    parts = [
+        *alternatives.findings(open_, elsewhere), *check_ghosts(ghosts, options.quality),
         *check_severed(tree, views), *check_hidden_ends(tree, views),
         *check_missing(tree, views),
     ]  # fmt: skip
+    findings = [*findings, *whole, *map(Part, parts), *map(Remark, check_border(tree, views))]
     lumen = [_lumen(seen, v.carm) for seen, v in zip(shown.prints, views, strict=True)]
     judged = assess(tree, views, lumen, findings, disagreement, options.quality)
     return dataclasses.replace(judged, exchanges=open_, ghosts=ghosts)
@@ -180,11 +184,12 @@ def assess(
         for view, inside in zip(views, lumen, strict=True)
     ]
     cut = [view.view_id for view in views if is_cut(view)]
-    findings = [*findings, *check_explained(judged, disagreement, kind_of(views), options, cut)]
+    explained = check_explained(judged, disagreement, kind_of(views), options, cut)
+    findings = gravest_first([*findings, *map(Part, explained)])
     return Quality(
         status=DEGRADED if findings else OK,
         sentence=_sentence(findings, tree, len(views)),
-        findings=tuple(findings),
+        findings=findings,
         separation_deg=best_separation([view.carm for view in views]),
         disagreement=disagreement,
         views=tuple(judged),

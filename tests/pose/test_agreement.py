@@ -17,6 +17,7 @@ from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.pose import agreement
 from gcar_deploy.pose.agreement import agreeing, order_of, other_order, poses_between
 from gcar_deploy.pose.partners import GAIN
+from gcar_deploy.quality import Remark
 
 render = pytest.importorskip("gcar_export.scenes.render", reason="needs the export extra")
 from gcar_export.scenes.trees import random_tree  # noqa: E402
@@ -121,6 +122,7 @@ def test_what_was_taken_for_a_device_comes_back_where_the_other_view_shows_it():
     assert not (kept[0].catheter & kept[0].mask).any()
     assert (kept[0].path_mm[back] == one.path_mm[back]).all()
     assert len(findings) == 1 and "look like a catheter" in findings[0]
+    assert isinstance(findings[0], Remark)
     # Where nobody remembers what it was, the views differ.
     forgotten = dataclasses.replace(lost, kept=None)
     assert agreeing(angiograms, [forgotten, two], OPTIONS)[1][1].after > 0.12

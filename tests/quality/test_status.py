@@ -10,6 +10,7 @@ import pytest
 from gcar_deploy.config import ImagingOptions, QualityOptions, RunOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.imaging.extract import extract_vessels
+from gcar_deploy.quality.gravity import Remark
 from gcar_deploy.quality.status import (
     assess,
     check_explained,
@@ -50,6 +51,25 @@ def test_a_missing_branch_lowers_coverage_and_a_ghost_lowers_support(case):
     more = dataclasses.replace(tree, branches=(*tree.branches, ghost))
     quality = view_quality(more, views[0], views[0].mask, OPTIONS)
     assert quality.coverage > 0.97 and quality.support < 0.9
+
+
+def test_the_gravest_finding_is_the_sentence(case):
+    _, views, tree = case
+    part = dataclasses.replace(tree, branches=tree.branches[:2])
+    findings = [Remark("a line was left out"), "the views are swapped", "the scale is off"]
+    judged = assess(part, views, [v.mask for v in views], findings, None, OPTIONS)
+    first, second, *parts, last = judged.findings
+    assert (first, second, last) == (findings[1], findings[2], findings[0])
+    assert parts and all("explained" in said for said in parts)
+    assert judged.sentence == f"The views are swapped (and {len(parts) + 2} more)."
+
+
+def test_a_branch_at_the_border_is_said_after_all_else(case, monkeypatch):
+    _, views, tree = case
+    for check, said in (("border", "a border"), ("missing", "a line"), ("scale", "a scale")):
+        monkeypatch.setattr(f"gcar_deploy.quality.status.check_{check}", lambda *_, s=said: [s])
+    judged = judge(tree, views, [], RunOptions(), disagreement=0.0, evidence=None)
+    assert judged.findings == ("a scale", "a line", "a border")
 
 
 def test_a_tree_somewhere_else_is_refused(case):
