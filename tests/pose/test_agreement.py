@@ -84,6 +84,16 @@ def test_a_part_without_counterpart_is_left_out_and_said():
     assert (kept[0].path_mm[~kept[0].mask] == 0).all()
 
 
+@pytest.mark.parametrize(("share", "said"), [(0.0, []), (0.005, []), (0.02, ["2%"])])
+def test_a_pixel_or_two_that_go_are_no_finding(share, said):
+    _, (view, _) = pair()
+    edge = np.argwhere(view.mask)[: round(share * view.mask.sum())]
+    fewer = view.mask.copy()
+    fewer[tuple(edge.T)] = False
+    found = agreement._changed([dataclasses.replace(view, mask=fewer)], [view])
+    assert [text.split()[2] for text in found] == said
+
+
 def test_a_line_through_the_tree_without_counterpart_is_left_out_and_said():
     angiograms, views = pair(stranger="crossing")
     before = poses_between(views, OPTIONS)[1].after
