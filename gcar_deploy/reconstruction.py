@@ -347,6 +347,7 @@ class Reconstruction:
             "distance_mm": judged.distance_mm,
             "overlap": judged.overlap,
             "coverage_2px": judged.coverage_2px,
+            "left_out": judged.left_out,
             "match_rate": judged.match_rate,
             "foreshortening": judged.foreshortening,
             "disagreement_before": pose.before,

@@ -75,6 +75,8 @@ def names_of(branches: list[dict[str, Any]]) -> str:
 
 def lines(path: Path, summary: dict[str, Any]) -> list[str]:
     """Return the summary for people."""
+    from gcar_deploy.output.words import explained
+
     tree, counts = summary["tree"], summary["counts"]
     made_by = {  # results of earlier versions do not name the segmenter
         key: "none" if summary.get(key) is None
@@ -92,10 +94,8 @@ def lines(path: Path, summary: dict[str, Any]) -> list[str]:
         f"  views {summary['separation_deg']:.1f} deg apart; {summary['seconds']['total']:.2f} s",
     ]
     for view in summary["views"]:
-        coverage = "-" if view["coverage"] is None else f"{view['coverage']:.0%}"
-        out.append(
-            f"  view {view['id']} ({view['name']}): {coverage} of the vessels seen are explained"
-        )
+        told = explained(view["coverage"], view.get("left_out", 0.0))
+        out.append(f"  view {view['id']} ({view['name']}): {told}")
     out.append(f"  files: {', '.join(summary.get('files', {}))}")
     out.append(f"  {summary['use']}")
     return out

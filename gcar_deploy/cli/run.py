@@ -79,6 +79,8 @@ def _step_folder(folder: Path, out: Path) -> OnStep:
 
 def summary_lines(result: Any, out_dir: Path) -> list[str]:
     """Return the path first, then a few lines for people."""
+    from gcar_deploy.output.words import explained
+
     tree = result.tree
     lines = [str(out_dir), f"{result.status}: {result.quality.sentence}"]
     lines.append(
@@ -86,8 +88,6 @@ def summary_lines(result: Any, out_dir: Path) -> list[str]:
         f"{len(result.gaussians.means_mm)} Gaussians, {result.seconds['total']:.2f} s"
     )
     for view in result.quality.views:
-        coverage = "-" if view.coverage is None else f"{view.coverage:.0%}"
-        lines.append(
-            f"view {view.view_id} ({view.name}): {coverage} of the vessels seen are explained"
-        )
+        told = explained(view.coverage, view.left_out)
+        lines.append(f"view {view.view_id} ({view.name}): {told}")
     return lines

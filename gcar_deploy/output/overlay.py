@@ -13,6 +13,7 @@ import numpy as np
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.output.words import LEFT_OUT, explained
 from gcar_deploy.quality import PROBABLE, ViewQuality
 from gcar_deploy.tree.tree import Tree, along, polyline_arc
 from gcar_deploy.types import Array, Image, Mask, Pixels, Scalars
@@ -27,7 +28,7 @@ _SHIFT = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _BAR_MM = 20
 _WHITE, _BLACK, _RED = (255, 255, 255), (0, 0, 0), (60, 40, 255)
-#: catheters, leads and wires that were left out; no branch is grey
+#: what was left out; no branch is grey
 _DEVICE = (200, 200, 200)
 _AROUND = tuple((dx, dy) for dx in (-2, -1, 0, 1, 2) for dy in (-2, -1, 0, 1, 2) if dx or dy)
 #: PNG by zlib's quickest, rows as they are: a third of the time, and a tenth more bytes
@@ -71,7 +72,7 @@ def backdrop(pixels: Image, missing: Mask, device: Mask | None = None) -> Backdr
     ----------
     pixels : (rows, cols) float32 picture as it was given
     missing : (rows, cols) what the tree leaves unexplained, which becomes red
-    device : (rows, cols) what was taken for a catheter and left out, which becomes light grey
+    device : (rows, cols) what was left out, which becomes light grey
     """
     rows, columns = pixels.shape
     zoom = min(math.ceil(_MIN_WIDTH / columns), max(1, _MAX_SIDE // max(rows, columns)))
@@ -195,7 +196,7 @@ def _labels(canvas: Array, judged: ViewQuality) -> None:
     size = max(canvas.shape[1] / 1000, 0.6)
     _text(canvas, f"View {judged.view_id}: {judged.name}", (14, round(34 * size)), size)
     if judged.coverage is not None:
-        text = f"{judged.coverage:.0%} of the vessels seen are explained"
+        text = explained(judged.coverage, judged.left_out)
         _text(canvas, text, (14, round(62 * size)), 0.7 * size)
 
 
@@ -211,7 +212,7 @@ def _legend(canvas: Array, pixel_mm: float, dashed: bool, device: bool) -> None:
     if dashed:
         entries.insert(1, ("dashed: probably not there", branch_color(0)))
     if device:
-        entries.append(("catheter or wire, left out", _DEVICE))
+        entries.append((LEFT_OUT, _DEVICE))
     step = round(34 * size)
     wide = max(_width(text, size) for text, _ in entries)
     for k, (text, color) in enumerate(entries):

@@ -16,6 +16,7 @@ import cv2
 from gcar_deploy.errors import GcarError
 from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.output.report_data import scene_data
+from gcar_deploy.output.words import LEFT_OUT, explained
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.types import Array
 
@@ -55,6 +56,7 @@ def report_html(
         "BUTTONS": "".join(_button(k, view) for k, view in enumerate(summary["views"]))
         + _further_button(summary),
         "FURTHER": _further(summary),
+        "LEFTOUT": _left_out(summary),
         "ANGLES": _angles(summary),
         "SHORTCOUNT": str(len(summary["views"]) + 1),
         "SHORTHEAD": "".join(
@@ -103,7 +105,7 @@ def _figure(number: int, view: Mapping[str, Any], picture: Array, most_bytes: in
     name = html.escape(f"View {view['id']}: {view['name']}")
     source = base64.b64encode(_jpeg(picture, most_bytes)).decode("ascii")
     details = [
-        f"{_share(view['coverage'])} of the vessels seen are explained",
+        explained(view["coverage"], view["left_out"]),
         f"{_share(view['support'])} of the tree seen",
         f"overlap (Dice) {_number(view['overlap'])}",
         f"mean distance {_number(view['distance_mm'], ' mm')}",
@@ -115,6 +117,14 @@ def _figure(number: int, view: Mapping[str, Any], picture: Array, most_bytes: in
         f"<figcaption><b>{name}</b><br>"
         f"{'; '.join(details)}</figcaption></figure>"
     )
+
+
+def _left_out(summary: Mapping[str, Any]) -> str:
+    """Say what the grey of the pictures is, where there is some."""
+    if not any(view["left_out"] for view in summary["views"]):
+        return ""
+    grey = '<span class="grey">Light grey</span> in the picture'
+    return f' <span class="hint">{grey}, {LEFT_OUT}.</span>'
 
 
 def _jpeg(picture: Array, most_bytes: int) -> bytes:

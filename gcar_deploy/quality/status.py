@@ -62,6 +62,7 @@ class ViewQuality:
     match_rate : share of the skeleton with a possible partner in the view that sees best across
     foreshortening : share of the tree's length that this view loses by looking along it
     coverage_even : as ``coverage``, with every pixel of the skeleton counted alike
+    left_out : share of what looks like vessel that was taken for a catheter or has no partner
 
     Undefined figures are None (no skeleton, or no tree in the picture).
     """
@@ -76,6 +77,7 @@ class ViewQuality:
     match_rate: float | None = None
     foreshortening: float | None = None
     coverage_even: float | None = None
+    left_out: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -318,7 +320,15 @@ def view_quality(
         match_rate=None if partner is None else _match_rate(view, partner),
         foreshortening=hidden_share(tree, view.carm),
         coverage_even=even,
+        left_out=_left_out(view),
     )
+
+
+def _left_out(view: VesselImage) -> float:
+    if view.catheter is None:
+        return 0.0
+    alone = int((view.catheter & ~view.mask).sum())
+    return alone / max(1, alone + int(view.mask.sum()))
 
 
 def _match_rate(view: VesselImage, partner: VesselImage) -> float | None:

@@ -11,6 +11,7 @@ from gcar_deploy.config import QualityOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.output.overlay import backdrop, branch_color, grey8, overlay, png_bytes
+from gcar_deploy.output.words import LEFT_OUT, explained
 from gcar_deploy.quality.status import ViewQuality, unexplained, view_quality
 from gcar_deploy.tree.tree import Branch, Tree, empty_tree
 
@@ -147,3 +148,22 @@ def test_a_catheter_has_a_colour_and_a_line_in_the_legend():
     assert not (plain[20 * zoom : 23 * zoom, 5 * zoom : 30 * zoom] == 200).all(axis=2).any()
     bottom = plain.shape[0] // 2
     assert (plain[bottom:] != picture[bottom:]).any()
+
+
+@pytest.mark.parametrize(("left_out", "more"), [
+    (0.0, ""), (0.019, ""), (0.118, " (12% of what looks like vessel was left out)"),
+])  # fmt: skip
+def test_what_was_left_out_is_said_beside_what_is_explained(left_out, more):
+    assert explained(0.94, left_out) == f"94% of the vessels seen are explained{more}"
+    assert explained(None, 0.0).startswith("- of the vessels")
+    assert "vessel without a partner" in LEFT_OUT
+
+
+def test_the_share_left_out_is_of_all_that_looks_like_vessel():
+    view = blank_view()
+    mask, device = np.zeros((2, *view.mask.shape), bool)
+    mask[60, 20:80], device[60, 75:90] = True, True
+    tree = line_tree(view.carm)
+    seen = dataclasses.replace(view, mask=mask, skeleton=mask, catheter=device)
+    assert view_quality(tree, seen, mask, OPTIONS).left_out == pytest.approx(10 / 70)
+    assert view_quality(tree, view, mask, OPTIONS).left_out == 0.0

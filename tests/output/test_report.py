@@ -8,9 +8,11 @@ import html.parser
 import json
 import re
 
+import numpy as np
 import pytest
 
 from gcar_deploy.output.report import _embedded, report_html
+from gcar_deploy.output.words import LEFT_OUT
 
 
 class Page(html.parser.HTMLParser):
@@ -97,12 +99,19 @@ def test_research_use_is_said_and_size_is_small(text):
     assert len(text) < 500_000
 
 
+def test_what_was_left_out_is_in_legend_and_caption(result, text):
+    assert LEFT_OUT not in text and "was left out" not in text
+    summary = result.summary()
+    summary["views"][1]["left_out"] = 0.12
+    page = report_html(result, summary, [np.zeros((16, 16, 3), np.uint8)] * 2)
+    assert page.count(LEFT_OUT) == 1
+    assert page.count("are explained (12% of what looks like vessel was left out);") == 1
+
+
 def test_hostile_names_stay_text(result):
     summary = result.summary()
     summary["views"][0]["id"] = summary["views"][0]["name"] = "</script><img onerror=x>__DATA__"
     summary["sentence"] = "<script>alert(1)</script>"
-    import numpy as np
-
     grey = np.zeros((16, 16, 3), np.uint8)
     parsed = Page()
     parsed.feed(report_html(result, summary, [grey, grey]))
