@@ -127,7 +127,7 @@ class Reconstruction:
         """Pd/Pa along each branch at the usual assumed flow."""
         found = () if self.quality.ghosts is None else self.quality.ghosts.probable
         ghosts = {ghost.branch: ghost.probability for ghost in found}
-        doubts = doubts_of(self.status, self.quality.sentence, len(self.tree.branches), ghosts)
+        doubts = doubts_of(self.status, len(self.tree.branches), ghosts)
         names = [None if name is None else name.name for name in self.names]
         tree, sections = self.lumen
         return pressure_drop(tree, tree_lumens(tree, sections), doubts=doubts, names=names)

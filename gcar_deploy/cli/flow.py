@@ -82,7 +82,7 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
     tree, sections = stored.lumen or lumen_tree(stored.tree, None)
     found = told.get("ambiguity", {}).get("probable_ghosts", ())
     ghosts = {ghost["branch"] - 1: ghost["probability"] for ghost in found}
-    doubts = doubts_of(told["status"], told["sentence"], len(tree.branches), ghosts)
+    doubts = doubts_of(told["status"], len(tree.branches), ghosts)
     names = [branch.get("name") for branch in told["tree"]["branches"]]
     drop = pressure_drop(tree, tree_lumens(tree, sections), assumed, doubts, names)
     table = pressure_table(drop)

@@ -135,18 +135,18 @@ def pressure_drop(
 
 
 def doubts_of(
-    status: str, sentence: str, branches: int, ghosts: Mapping[int, float] | None = None
+    status: str, branches: int, ghosts: Mapping[int, float] | None = None
 ) -> dict[int, str]:
     """Say of which branches nothing may be told.
 
     Parameters
     ----------
-    status, sentence : of the result; nothing is told of a degraded one
+    status : of the result; nothing is told of a degraded one
     branches : how many there are
     ghosts : branch -> probability that it is one
     """
     if status == "degraded":
-        return dict.fromkeys(range(branches), f"the result is degraded: {sentence}")
+        return dict.fromkeys(range(branches), "the tree is degraded")
     return {k: f"it is a ghost with probability {p:.2f}" for k, p in (ghosts or {}).items()}
 
 

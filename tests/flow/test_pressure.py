@@ -84,14 +84,14 @@ def test_a_value_is_withheld_where_its_interval_is_wide_and_given_where_it_is_no
 def test_a_degraded_result_tells_nothing():
     tree = stenosed_fork(0.0)
     lumens = tree_lumens(tree)
-    for vessel in pressure_drop(tree, lumens, doubts=doubts_of("degraded", "Why.", 3)).vessels:
-        assert vessel.withheld == "the result is degraded: Why." and not vessel.told.any()
+    for vessel in pressure_drop(tree, lumens, doubts=doubts_of("degraded", 3)).vessels:
+        assert vessel.withheld == "the tree is degraded" and not vessel.told.any()
     # Nor at points where the interval of a wide one is still narrow.
     narrow = stenosed(65.0)
     doubted = pressure_drop(narrow, tree_lumens(narrow), doubts={0: "why"}).vessels[0]
     assert drop_of(narrow).vessels[0].told.any() and not doubted.told.any()
-    assert doubts_of("ok", "Fine.", 3) == {}
-    assert doubts_of("ok", "Fine.", 3, {1: 0.9}) == {1: "it is a ghost with probability 0.90"}
+    assert doubts_of("ok", 3) == {}
+    assert doubts_of("ok", 3, {1: 0.9}) == {1: "it is a ghost with probability 0.90"}
 
 
 def test_a_doubt_goes_downstream_and_not_beside():
