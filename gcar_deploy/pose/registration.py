@@ -157,7 +157,7 @@ def _two_contradictions(poses: Sequence[Pose]) -> str:
     return (
         "the views contradict each other: in the contrasts of their vessels, and by "
         f"{moved:.1f} mm (root mean square) in where these turn and end; different patients, "
-        "frames or angles?"
+        "frames, angles or pixel sizes?"
     )
 
 

@@ -134,7 +134,7 @@ def check_agreement(
         raise RefusedError(
             f"views {first} and {second} contradict each other: the vessels "
             f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
-            f"{why}different patients, frames or angles?"
+            f"{why}different patients, frames, angles or pixel sizes?"
         )
     if disagreement > (min(good, options.sure_disagreement_raw) if kind == "raw" else good):
         return [

@@ -234,7 +234,7 @@ def check_explained(
                     f"the views contradict each other: {disagreement:.0%} of the vessels differ "
                     f"along the epipolar lines, and no tree explains more than "
                     f"{even[one.view_id]:.0%} of the lines in view {one.view_id}; "
-                    "different patients, frames or angles?"
+                    "different patients, frames, angles or pixel sizes?"
                 )
             findings.append(
                 f"view {one.view_id}: only {even[one.view_id]:.0%} of the lines are explained; "

@@ -102,7 +102,7 @@ def test_doubtful_views_that_no_tree_explains_contradict(case):
     _, views, tree = case
     part = dataclasses.replace(tree, branches=tree.branches[:2])
     masks = [v.mask for v in views]
-    with pytest.raises(RefusedError, match="contradict"):
+    with pytest.raises(RefusedError, match=r"contradict.*angles or pixel sizes\?"):
         assess(part, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS)
     assert assess(part, views, masks, [], OPTIONS.good_disagreement, OPTIONS).status == "degraded"
     assert assess(tree, views, masks, [], OPTIONS.good_disagreement + 0.01, OPTIONS).status == "ok"
