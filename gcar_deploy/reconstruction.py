@@ -173,7 +173,8 @@ class Reconstruction:
         )
         stills = tuple(pose.still(a) for pose, a in zip(poses, angiograms, strict=True))
         judged = tuple(self.quality.views[p] for p in places)
-        said = (p.note(a.view_id) for p, a in zip(poses, angiograms, strict=True))
+        gates, count = options.quality, len(poses)
+        said = (p.note(a.view_id, count, gates) for p, a in zip(poses, angiograms, strict=True))
         means = self.gaussians.means_mm + frame.origin_mm
         given = dataclasses.replace(
             self,

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gcar_deploy.config import PoseOptions
+from gcar_deploy.config import PoseOptions, QualityOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
 from gcar_deploy.geometry.consistency import (
     Mass,
@@ -99,13 +99,21 @@ class Pose:
         """The larger of the two angle corrections."""
         return max(abs(self.primary_deg), abs(self.secondary_deg))
 
-    def note(self, view: str) -> str | None:
-        """Return a large correction in words, for the view of that name; None of a small one."""
+    def note(self, view: str, count: int, options: QualityOptions) -> str | None:
+        """Return a large correction in words, for the view of that name; None of a small one.
+
+        Of ``count`` views two leave part of a move unseen. Above the gates a finding says so.
+        """
         if self.shift_mm < SAID_SHIFT_MM and self.turn_deg < SAID_TURN_DEG:
             return None
+        found = self.shift_mm > options.good_shift_mm or self.turn_deg > options.good_turn_deg
+        unseen = "" if found or count > 2 else (
+            "; a move within the plane of both beams may not show: the whole tree may lie off by it"
+        )  # fmt: skip
         return (
             f"view {view} was taken for moved by {self.shift_mm:.1f} mm and turned by "
             f"{self.turn_deg:.1f} deg, so that it agrees with the others (--pose off: as told)"
+            f"{unseen}"
         )
 
     def at(self, theta: Array) -> Pose:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gcar_deploy.config import PoseOptions
+from gcar_deploy.config import PoseOptions, QualityOptions
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.imaging.mask_path import mask_path
@@ -167,9 +167,20 @@ def test_blank_picture_and_switched_off():
 
 
 def test_a_large_correction_is_said_in_words():
-    assert Pose().note("2") is None
-    assert Pose(offset_mm=(1.0, 1.0, 1.0), primary_deg=-0.9).note("2") is None
-    said = Pose(offset_mm=(2.0, 0.0, -2.0), secondary_deg=0.4).note("b")
+    gates = QualityOptions()
+    assert Pose().note("2", 2, gates) is None
+    assert Pose(offset_mm=(1.0, 1.0, 1.0), primary_deg=-0.9).note("2", 2, gates) is None
+    said = Pose(offset_mm=(2.0, 0.0, -2.0), secondary_deg=0.4).note("b", 2, gates)
     assert said is not None
     assert "view b" in said and "2.8 mm" in said and "0.4 deg" in said
-    assert "1.2 deg" in (Pose(primary_deg=-1.2).note("b") or "")
+    assert "1.2 deg" in (Pose(primary_deg=-1.2).note("b", 2, gates) or "")
+
+
+def test_two_views_do_not_see_all_of_a_move_and_say_so_once():
+    gates = QualityOptions()
+    moved = Pose(offset_mm=(0.0, 0.0, 4.2))
+    assert "may not show" in moved.note("2", 2, gates)
+    assert "may not show" not in moved.note("2", 3, gates)
+    # Beyond the gates a finding says it (``check_poses``).
+    for more in (Pose(offset_mm=(0.0, 0.0, 5.2)), Pose(secondary_deg=1.6)):
+        assert "may not show" not in more.note("2", 2, gates)
