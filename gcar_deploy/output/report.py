@@ -226,9 +226,8 @@ def pressure_rows(summary: Mapping[str, Any]) -> str:
 
 
 def _sentences(summary: Mapping[str, Any]) -> list[str]:
-    """List findings and notes; a single finding is the status sentence already."""
-    findings = list(summary["findings"])
-    return [*(findings if len(findings) > 1 else []), *summary["notes"]]
+    """List findings and notes; the first finding is the status sentence already."""
+    return [*summary["findings"][1:], *summary["notes"]]
 
 
 def _facts(summary: Mapping[str, Any]) -> str:

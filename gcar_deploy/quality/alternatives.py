@@ -73,7 +73,7 @@ def findings(alternatives: Sequence[Exchange], elsewhere: float | None) -> list[
         )
     if elsewhere is not None and elsewhere > MOST_ELSEWHERE:
         out.append(
-            f"{elsewhere:.0%} of the evidence on the vessels' rays lies in other places (at most "
+            f"{elsewhere:.0%} of what may be vessel along the beams lies off the tree (at most "
             f"{MOST_ELSEWHERE:.0%} is usual): branches may lie elsewhere"
         )
     return out

@@ -22,6 +22,8 @@ from gcar_deploy.tree.tree import Tree
 
 #: exact views of which vessels are cut are believed when they ask for a shift up to this, mm
 CUT_SHIFT_MM = 1.0
+#: disagreement along the epipolar lines, for those who never heard of them
+NO_MATCH = "no match where the beams of both views meet"
 
 
 def best_separation(carms: Sequence[CArm]) -> float:
@@ -132,14 +134,14 @@ def check_agreement(
     if disagreement > most:
         why = f"vessels run out of view {cut[0]}, or " if cut else ""
         raise RefusedError(
-            f"views {first} and {second} contradict each other: the vessels "
-            f"differ by {disagreement:.0%} along the epipolar lines (at most {most:.0%}); "
+            f"views {first} and {second} contradict each other: {disagreement:.0%} of the "
+            f"vessels have {NO_MATCH} (at most {most:.0%}); "
             f"{why}different patients, frames, angles or pixel sizes?"
         )
     if disagreement > (min(good, options.sure_disagreement_raw) if kind == "raw" else good):
         return [
             f"view {second} agrees poorly with view {first}: {disagreement:.0%} of "
-            "the vessel differs along the epipolar lines"
+            f"the vessels have {NO_MATCH}"
         ]
     return []
 
@@ -171,7 +173,8 @@ def check_order(
         return [], ""
     first, second = view_ids
     instead = (
-        f"the other way round ({other_order:.0%} of the vessels differ, not {disagreement:.0%})"
+        f"with their pictures exchanged ({other_order:.0%} of the vessels differ, "
+        f"not {disagreement:.0%})"
     )
     if other_order <= min(good, options.swapped_ratio * disagreement):
         hint = f"views {first} and {second} agree far better {instead}: are the pictures swapped?"

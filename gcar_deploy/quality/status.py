@@ -19,7 +19,13 @@ from gcar_deploy.predict import Evidence
 from gcar_deploy.quality import alternatives
 from gcar_deploy.quality.anatomy import check_anatomy
 from gcar_deploy.quality.border import check_border
-from gcar_deploy.quality.gates import best_separation, disagreement_limits, is_cut, kind_of
+from gcar_deploy.quality.gates import (
+    NO_MATCH,
+    best_separation,
+    disagreement_limits,
+    is_cut,
+    kind_of,
+)
 from gcar_deploy.quality.ghosts import Ghosts, check_ghosts, find_ghosts
 from gcar_deploy.quality.gravity import Part, Remark, gravest_first
 from gcar_deploy.quality.hidden_ends import check_hidden_ends
@@ -231,8 +237,8 @@ def check_explained(
         if doubtful and even[one.view_id] < enough:
             if not whole:
                 raise RefusedError(
-                    f"the views contradict each other: {disagreement:.0%} of the vessels differ "
-                    f"along the epipolar lines, and no tree explains more than "
+                    f"the views contradict each other: {disagreement:.0%} of the vessels have "
+                    f"{NO_MATCH}, and no tree explains more than "
                     f"{even[one.view_id]:.0%} of the lines in view {one.view_id}; "
                     "different patients, frames, angles or pixel sizes?"
                 )

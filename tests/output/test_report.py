@@ -108,6 +108,13 @@ def test_what_was_left_out_is_in_legend_and_caption(result, text):
     assert page.count("are explained (12% of what looks like vessel was left out);") == 1
 
 
+def test_the_headline_is_not_listed_once_more(result):
+    summary = result.summary()
+    summary["sentence"], summary["findings"] = "First (and 1 more).", ["first", "second"]
+    page = report_html(result, summary, [np.zeros((16, 16, 3), np.uint8)] * 2)
+    assert "<li>second</li>" in page and "<li>first</li>" not in page
+
+
 def test_hostile_names_stay_text(result):
     summary = result.summary()
     summary["views"][0]["id"] = summary["views"][0]["name"] = "</script><img onerror=x>__DATA__"

@@ -199,7 +199,7 @@ def test_of_three_pictures_the_two_that_are_swapped_are_named(swap):
     given[j] = dataclasses.replace(views[i], carm=views[j].carm, view_id=views[j].view_id)
     options = dataclasses.replace(OPTIONS, pose=PoseOptions(enabled=False))
     _, hint = order_of(given, poses_between(given, options), options)
-    assert hint.startswith(f"views {i + 1} and {j + 1} agree far better the other way round")
+    assert hint.startswith(f"views {i + 1} and {j + 1} agree far better with their pictures")
     assert order_of(views, poses_between(views, options), options) == ([], "")
 
 
