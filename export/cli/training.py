@@ -31,6 +31,7 @@ _on_pictures = taking(
     click.option("--real", type=FOLDER, help="Real angiograms to train on: N.png, N_gt.png."),
     click.option("--fold", metavar="K/N", help="Leave the K-th of N parts of them out."),
     click.option("--pictures", type=COUNT, help="Generated ones, drawn; each is used often."),
+    click.option("--validation-pictures", type=COUNT, help="Held-out ones, that it is scored on."),
     click.option("--pool", type=OUT_FOLDER, help="Folder that keeps them, for several runs."),
     click.option("--minutes", type=DURATION, help="Stop after so long; the same command goes on."),
 )

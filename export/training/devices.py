@@ -32,7 +32,7 @@ from gcar_export.scenes.device_pictures import (
 from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.training.loop import Lesson, learn
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
-from gcar_export.training.run_folder import RunFolder
+from gcar_export.training.run_folder import Flag, RunFolder, heeding
 from gcar_export.training.segmenter import changes, real_pictures
 from gcar_export.training.segmenter_start import devices_of, vessels_sha256, with_that_of
 
@@ -145,11 +145,11 @@ def tensors(points: Any, label: Any, near: Any) -> tuple[torch.Tensor, torch.Ten
 
 
 @torch.no_grad()
-def validate(net: LineNet, pictures: Pictures) -> dict[str, float]:
+def validate(net: LineNet, pictures: Pictures, stop: Flag) -> dict[str, float]:
     """Share of devices' and of vessels' points called a device; devices found at 1 % of vessel."""
     net.eval()
     said, truth = [np.zeros(0)], [np.zeros(0)]
-    for k in range(pictures.options.validation_pictures):
+    for k in heeding(stop, range(pictures.options.validation_pictures)):
         picture = pictures.one(VALIDATION_SEED, k)
         if len(picture.label):
             points, near, _ = tensors(picture.lines.points, picture.label, picture.lines.near)
@@ -209,7 +209,7 @@ def train(
     lesson: Lesson[LineNet, Batch] = Lesson(
         lambda step: (pictures.batch(k) for k in range(step, options.steps)),
         lambda batch: _loss(net, batch),
-        lambda mean: validate(mean, pictures),
+        lambda mean, stop: validate(mean, pictures, stop),
     )
     learn(folder, net, options, lesson, minutes)
 

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
+import click
 import torch
 
 from gcar_export.training.mean_weights import MeanWeights
-from gcar_export.training.run_folder import ProgressLine, RunFolder, until_interrupted
+from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, until_interrupted
 
 N = TypeVar("N", bound=torch.nn.Module)
 B = TypeVar("B")
 #: the gradient is made no longer than this
 _CLIP = 1.0
-#: steps whose mean loss is told
-_RECENT = 100
 
 
 class Schedule(Protocol):
@@ -77,12 +74,12 @@ class Lesson(Generic[N, B]):
     ----------
     batches : of the steps from the given one to the last
     loss_of : loss of a batch; None where it asks nothing
-    validate : scores of a network on what is held out
+    validate : scores of a network on what is held out; heeds the flag (``run_folder.heeding``)
     """
 
     batches: Callable[[int], Iterable[B]]
     loss_of: Callable[[B], torch.Tensor | None]
-    validate: Callable[[N], dict[str, float]]
+    validate: Callable[[N, Flag], dict[str, float]]
 
 
 def learn(
@@ -94,7 +91,7 @@ def learn(
 ) -> None:
     """Train ``net`` or go on training it in ``folder``; stop after ``minutes`` if given.
 
-    The mean of its weights is scored at the end and kept in the checkpoint beside them.
+    The mean of its weights is kept in the checkpoint beside them, and scored when all are saved.
     """
     learn_together([(folder, net, lesson)], options, minutes)
 
@@ -112,7 +109,7 @@ def learn_together(
     Raises
     ------
     KeyboardInterrupt
-        On Ctrl-C, when all are saved.
+        On Ctrl-C or SIGTERM, when all are saved.
     """
     if all(folder.finished(options.steps) for folder, _, _ in pupils):
         return
@@ -130,16 +127,19 @@ def learn_together(
                     run.take(batch)
             step += 1
             if line.due(step):
-                line.show(step, runs[0].recent())
+                line.show(step, runs[0].folder.losses)
             if step % options.save_every == 0 and step < options.steps:
                 for run in runs:
                     run.save()
         for run in runs:
+            run.save()
+        try:
+            for run in runs:
+                run.score(stop)
+        finally:
             if stop.is_set():
-                run.save()
-                run.folder.interrupt(run.step)
-            else:
-                run.finish()
+                for run in runs:
+                    run.folder.interrupt(run.step)
 
 
 class _Run(Generic[N, B]):
@@ -154,7 +154,6 @@ class _Run(Generic[N, B]):
         )
         self.mean = MeanWeights(net, options.mean_steps)
         self.step = folder.resume(net, self.optimiser, self.mean.net)
-        self._losses: deque[torch.Tensor] = deque(maxlen=_RECENT)
 
     def take(self, batch: B) -> None:
         """Take a step down the loss of a batch, unless its gradient is not finite."""
@@ -167,21 +166,18 @@ class _Run(Generic[N, B]):
             norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), _CLIP)
             if bool(torch.isfinite(norm)):
                 self.optimiser.step()
-            self._losses.append(loss.detach())
+            self.folder.took(float(loss.detach()))
         self.step += 1
         self.mean.add(self.net, self.step)
 
-    def recent(self) -> list[float]:
-        """Losses of the last steps."""
-        return [float(loss) for loss in self._losses]
-
-    def save(self, extra: dict[str, object] | None = None) -> None:
+    def save(self) -> None:
         """Write the checkpoint."""
-        self.folder.save(self.net, self.optimiser, self.step, extra, self.mean.net)
+        self.folder.save(self.net, self.optimiser, self.step, mean=self.mean.net)
 
-    def finish(self) -> None:
-        """Score the mean of the weights and write the last checkpoint."""
-        scores = self.lesson.validate(self.mean.net)
-        self.save({"validation": scores})
-        recent = [loss for loss in self.recent() if np.isfinite(loss)]
-        self.folder.log(self.step, float(np.mean(recent or [np.nan])), {"all": scores})
+    def score(self, stop: Flag) -> None:
+        """Score the mean of the weights that were saved, unless they were or ``stop`` is up."""
+        if stop.is_set() or self.folder.scored(self.step):
+            return
+        click.echo(f"{self.folder.path} is saved at step {self.step}; it is scored now", err=True)
+        scores = self.lesson.validate(self.mean.net, stop)
+        self.folder.log(self.step, {"all": scores}, scores)

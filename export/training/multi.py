@@ -14,7 +14,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,13 @@ from gcar_export.training.dataset import TrainingScene, training_scene
 from gcar_export.training.examinations import SceneOptions
 from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
-from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, until_interrupted
+from gcar_export.training.run_folder import (
+    Flag,
+    ProgressLine,
+    RunFolder,
+    heeding,
+    until_interrupted,
+)
 from gcar_export.training.scene_stream import in_order, leave_interrupts_to_the_parent
 from gcar_export.training.warm_start import inherited, predictor_of
 
@@ -140,7 +146,7 @@ def scene_loss(outputs: list[torch.Tensor], scene: TrainingScene) -> torch.Tenso
 
 
 @torch.no_grad()
-def validate(net: SparsePredictor, scenes: list[TrainingScene]) -> dict[str, dict[str, float]]:
+def validate(net: SparsePredictor, scenes: Iterable[TrainingScene]) -> dict[str, dict[str, float]]:
     """Dice at 0.5, and precision and recall within 1.5 cells, per kind of scene."""
     from scipy.spatial import cKDTree
 
@@ -203,7 +209,7 @@ def train(
     ModelError
         ``warm_start`` is no multi-view predictor, or one of another size.
     KeyboardInterrupt
-        On Ctrl-C, when the run is saved.
+        On Ctrl-C or SIGTERM, when the run is saved.
     """
     job = _Job(
         out, options, config or SparseConfig(), until, tuple(labels), dict(label_hashes or {}),
@@ -211,8 +217,9 @@ def train(
     )  # fmt: skip
     if _run_folder(job).finished(options.steps):
         return
-    stop = torch.multiprocessing.get_context("spawn").Event()
-    with until_interrupted(stop):
+    # One process asks the flag that its own signal raises: a shared one, which locks, would hang.
+    shared = torch.multiprocessing.get_context("spawn").Event() if options.replicas > 1 else None
+    with until_interrupted(shared) as stop:
         _replicas(job, stop)
 
 
@@ -274,15 +281,26 @@ def _replica(rank: int, job: _Job, stop: Flag) -> None:
     )
     mean = MeanWeights(net, options.mean_steps)
     step = run.resume(net, optimiser, mean.net)
-    held_out = []
-    if rank == 0:
-        held_out = [
-            training_scene(VALIDATION_SEED, i, scenes) for i in range(options.validation_scenes)
-        ]
+    drawn_once = functools.cache(lambda i: training_scene(VALIDATION_SEED, i, scenes))
+
+    def save_and_score() -> None:
+        due = step > 0 and (step % options.save_every == 0 or step == options.steps)
+        if rank or not due or run.scored(step):
+            return
+        run.save(net, optimiser, step, mean=mean.net)
+        # The other replicas wait: the flag ends them all at the head of the loop.
+        with contextlib.suppress(KeyboardInterrupt):
+            held_out = map(drawn_once, heeding(stop, range(options.validation_scenes)))
+            scores = validate(mean.net, held_out)
+            run.log(step, scores, scores)
+            _tell(step, scores)
+
+    # The run before may have ended while it was scored.
+    save_and_score()
     # Every scene has another number of points: shapes stay symbols in the compiled graph.
     forward = torch.compile(net, dynamic=True) if options.compiled else net
     line = ProgressLine(step, options.steps, options.replicas, "scenes")
-    began, losses = time.monotonic(), []
+    began = time.monotonic()
     draw = functools.partial(training_scene, options.seed, options=scenes, labels=job.labels)
     numbers = range(
         step * options.replicas + rank, options.steps * options.replicas, options.replicas
@@ -304,16 +322,12 @@ def _replica(rank: int, job: _Job, stop: Flag) -> None:
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), options.clip)
             if bool(torch.isfinite(norm)):
                 optimiser.step()
-            losses.append(float(loss.detach()))
+            run.took(float(loss.detach()))
             step += 1
             mean.add(net, step)
             if rank == 0:
-                line.show(step, losses)
-            if rank == 0 and (step % options.save_every == 0 or step == options.steps):
-                scores = validate(mean.net, held_out)
-                run.save(net, optimiser, step, {"validation": scores}, mean.net)
-                run.log(step, float(np.mean(losses[-250:])), scores)
-                _tell(step, scores)
+                line.show(step, run.losses)
+            save_and_score()
     if rank == 0:
         run.save(net, optimiser, step, mean=mean.net)
         if stop.is_set():

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,13 @@ from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training import losses
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.paper_dataset import POSES, VIEWS, TrainingPicture, training_pictures
-from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, until_interrupted
+from gcar_export.training.run_folder import (
+    Flag,
+    ProgressLine,
+    RunFolder,
+    heeding,
+    until_interrupted,
+)
 
 #: trees with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -174,7 +181,7 @@ def batch_loss(
 
 @torch.no_grad()
 def validate(
-    net: UNetPredictor, pictures: Sequence[TrainingPicture]
+    net: UNetPredictor, pictures: Iterable[TrainingPicture]
 ) -> dict[str, dict[str, float]]:
     """Per kind: share of centres within 1.5 pixels of the centreline and back; depth error.
 
@@ -219,7 +226,7 @@ def train(
     UsageError
         ``out`` holds a run of another network, size, seed or set of labels.
     KeyboardInterrupt
-        On Ctrl-C, when the run is saved.
+        On Ctrl-C or SIGTERM, when the run is saved.
     """
     run = RunFolder(out, _manifest(options, config, label_hashes or {}))
     if not run.finished(options.steps):
@@ -239,14 +246,30 @@ def _train(
         net.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
     step = run.resume(net, optimiser)
-    held_out = [
-        p
-        for i in range(options.validation_trees)
-        for p in training_pictures(VALIDATION_SEED, i * POSES, config, usual=options.usual)
-    ]
+    skipped = int(run.manifest.get("skipped_steps", 0))
+    drawn_once = functools.cache(
+        lambda i: training_pictures(VALIDATION_SEED, i * POSES, config, usual=options.usual)
+    )
+
+    def save_and_score() -> None:
+        due = step > 0 and (step % options.save_every == 0 or step == options.steps)
+        if not due or run.scored(step):
+            return
+        run.save(net, optimiser, step, {"skipped_steps": skipped})
+        # The flag ends the loop.
+        with contextlib.suppress(KeyboardInterrupt):
+            trees = heeding(stop, range(options.validation_trees))
+            scores = validate(net, (p for i in trees for p in drawn_once(i)))
+            error = float(np.mean([s["depth_error"] for s in scores.values()]))
+            run.keep_best(step, error, scores)
+            run.log(step, scores, scores)
+            _tell(step, scores)
+
     forward = torch.compile(net) if options.compiled else net
     line = ProgressLine(step, options.steps, options.trees * VIEWS, "pictures")
-    began, recent, skipped = time.monotonic(), [], 0
+    began = time.monotonic()
+    # The run before may have ended while it was scored.
+    save_and_score()
     while step < options.steps:
         if stop.is_set() or (until is not None and time.monotonic() - began > until):
             break
@@ -271,17 +294,11 @@ def _train(
             optimiser.step()
         else:
             skipped += 1
-        recent.append(float(loss.detach()))
+        run.took(float(loss.detach()))
         step += 1
-        line.show(step, recent)
-        if step % options.save_every == 0 or step == options.steps:
-            scores = validate(net, held_out)
-            run.save(net, optimiser, step, {"validation": scores, "skipped_steps": skipped})
-            run.log(step, float(np.mean(recent[-250:])), scores)
-            error = float(np.mean([s["depth_error"] for s in scores.values()]))
-            run.keep_best(step, error, scores)
-            _tell(step, scores)
-    run.save(net, optimiser, step)
+        line.show(step, run.losses)
+        save_and_score()
+    run.save(net, optimiser, step, {"skipped_steps": skipped})
     if stop.is_set():
         run.interrupt(step)
 

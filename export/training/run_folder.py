@@ -8,6 +8,7 @@ Each file is replaced whole, so an interruption at any moment leaves a folder to
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import csv
 import json
@@ -17,9 +18,9 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import click
 import numpy as np
@@ -33,7 +34,15 @@ SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from
 FIXED = ("network", "config", "seed", "labels", "warm_start", "scenes", "segmenter")
 #: options that may change on the way: how long, how often saved, by what it is worked on
-FREE = ("steps", "decay_steps", "warmup_steps", "save_every", "workers", "device", "compiled")
+FREE = (
+    "steps", "decay_steps", "warmup_steps", "save_every", "workers", "device", "compiled",
+    "validation_pictures",
+)  # fmt: skip
+#: finite losses whose mean is logged
+RECENT = 250
+#: what a manifest takes over from the one of the run that goes on
+_KEPT = ("best", "validation", "skipped_steps")
+T = TypeVar("T")
 
 
 class RunFolder:
@@ -55,6 +64,8 @@ class RunFolder:
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
         self.path = path
         self.manifest: dict[str, Any] = {"schema": SCHEMA, **manifest}
+        #: kept in the checkpoint, so that a run that goes on logs what it would have logged
+        self.losses: collections.deque[float] = collections.deque(maxlen=RECENT)
         self._scored = -1
         self._check_same()
         path.mkdir(parents=True, exist_ok=True)
@@ -63,6 +74,10 @@ class RunFolder:
     def checkpoint(self) -> Path:
         """Where the weights are."""
         return self.path / "checkpoint.safetensors"
+
+    @property
+    def _log(self) -> Path:
+        return self.path / "log.csv"
 
     def _check_same(self) -> None:
         file = self.path / "manifest.json"
@@ -88,10 +103,19 @@ class RunFolder:
                     f"{self.path} holds a run with {_shown(key, was)}, this one has "
                     f"{_shown(key, wanted)}; give another --out, or the same {key}"
                 )
-        if "best" in before:
-            self.manifest["best"] = before["best"]
-        if self.checkpoint.is_file() and "validation" in before:
-            self._scored = int(before.get("step", 0))
+        if self.checkpoint.is_file():
+            self.manifest |= {key: before[key] for key in _KEPT if key in before}
+            # Weights are saved before they are scored: a row says that they were.
+            self._scored = max((int(r["step"]) for r in read_log(self._log)), default=-1)
+
+    def took(self, loss: float) -> None:
+        """Keep the loss of a step for the mean; one that is not finite has none."""
+        if np.isfinite(loss):
+            self.losses.append(loss)
+
+    def scored(self, step: int) -> bool:
+        """Whether what was learned up to ``step`` was scored."""
+        return self._scored >= step
 
     def finished(self, steps: int) -> bool:
         """Whether all steps were taken and scored before; says so."""
@@ -125,6 +149,7 @@ class RunFolder:
             step = int(data["step"])
         except (RuntimeError, KeyError):
             raise ModelError(f"{self.checkpoint} does not fit its manifest.json") from None
+        self.losses.extend(data.get("losses", torch.zeros(0)).tolist())
         state: dict[int, dict[str, torch.Tensor]] = {}
         for n, (name, _) in enumerate(net.named_parameters()):
             prefix = f"opt.{name}."
@@ -154,6 +179,7 @@ class RunFolder:
             for key, value in optimiser.state.get(p, {}).items():
                 data[f"opt.{name}.{key}"] = _kept(value)
         data["step"] = torch.tensor(step)
+        data["losses"] = torch.tensor(list(self.losses), dtype=torch.float64)
         partial = self.path / "checkpoint.tmp"
         save_file(data, partial)
         self.manifest.update(extra or {})
@@ -188,14 +214,18 @@ class RunFolder:
         (self.path / "manifest.tmp").write_text(text, encoding="utf-8")
         os.replace(self.path / "manifest.tmp", self.path / "manifest.json")
 
-    def log(self, step: int, loss: float, scores: Mapping[str, Mapping[str, float]]) -> None:
+    def log(self, step: int, scores: Mapping[str, Mapping[str, float]], validation: Any) -> None:
         """Add one validation (kind of scene -> measure -> value) to log.csv and redraw the curve.
 
-        Rows of this step and later ones, left by a run that was cut off, are replaced.
+        Rows of this step and later ones, left by a run that was cut off, are replaced. The manifest
+        gets ``validation``.
         """
+        self.manifest["validation"] = validation
+        self._write_manifest()
+        loss = float(np.mean(self.losses)) if self.losses else float("nan")
         names = list(next(iter(scores.values())))
         header = ["step", "loss", "kind", *names]
-        file = self.path / "log.csv"
+        file = self._log
         rows = [r for r in read_log(file) if int(r["step"]) < step]
         partial = file.with_suffix(".tmp")
         with partial.open("w", newline="", encoding="utf-8") as f:
@@ -206,6 +236,7 @@ class RunFolder:
                 shown = {k: f"{v:.4f}" for k, v in score.items()}
                 writer.writerow({"step": step, "loss": f"{loss:.4f}", "kind": kind, **shown})
         os.replace(partial, file)
+        self._scored = step
         draw_curve(read_log(file), self.path / "curve.png")
 
 
@@ -221,6 +252,10 @@ def check_device(device: str) -> None:
         raise UsageError("preset gpu needs a CUDA device, and torch finds none; use cpu")
 
 
+#: signals that end a training in good order
+STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
 class Flag(Protocol):
     """What ``threading.Event`` and that of ``multiprocessing`` have in common."""
 
@@ -233,7 +268,9 @@ class Flag(Protocol):
 
 @contextlib.contextmanager
 def until_interrupted(stop: Flag | None = None) -> Iterator[Flag]:
-    """Give a flag that Ctrl-C raises: the training saves after its step. Again ends at once.
+    """Give a flag that Ctrl-C and SIGTERM raise: the training saves after its step.
+
+    Schedulers send SIGTERM. A second one of either ends at once.
 
     Raises
     ------
@@ -242,21 +279,40 @@ def until_interrupted(stop: Flag | None = None) -> Iterator[Flag]:
     """
     stop = stop or threading.Event()
     main = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGINT)
+    before = {number: signal.getsignal(number) for number in STOPS}
+
+    def back() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def interrupted(*_: object) -> None:
-        signal.signal(signal.SIGINT, before)
+        back()
         stop.set()
 
     if main:
-        signal.signal(signal.SIGINT, interrupted)
+        for number in STOPS:
+            signal.signal(number, interrupted)
     try:
         yield stop
     finally:
         if main:
-            signal.signal(signal.SIGINT, before)
+            back()
     if stop.is_set():
         raise KeyboardInterrupt
+
+
+def heeding(stop: Flag, items: Iterable[T]) -> Iterator[T]:
+    """Yield the items as long as the flag is down: what is saved need not wait for its score.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The flag is up.
+    """
+    for item in items:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        yield item
 
 
 class ProgressLine:
@@ -271,16 +327,18 @@ class ProgressLine:
         """Whether it is its turn after ``step``."""
         return step % self.every == 0 or step == self.steps
 
-    def show(self, step: int, losses: Sequence[float]) -> None:
+    def show(self, step: int, losses: Iterable[float]) -> None:
         """Print after ``step`` if it is its turn."""
         if not self.due(step):
             return
         rate = (step - self.first) / max(time.monotonic() - self.began, 1e-9)
         left = (self.steps - step) / max(rate, 1e-9) / 60
-        recent = [loss for loss in losses[-100:] if np.isfinite(loss)]
+        recent = list(losses)[-100:]
+        # Scoring comes after the last step: no time is said to be left where it is not over.
+        end = "scoring follows" if step >= self.steps else f"{np.ceil(left):.0f} min of steps left"
         click.echo(
             f"step {step}/{self.steps}  loss {np.mean(recent or [np.nan]):.4f}  "
-            f"{rate * self.per_step:.2f} {self.what}/s  {left:.0f} min left",
+            f"{rate * self.per_step:.2f} {self.what}/s  {end}",
             err=True,
         )
 

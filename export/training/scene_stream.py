@@ -42,8 +42,12 @@ def in_order(
 
 
 def leave_interrupts_to_the_parent(*_: object) -> None:
-    """Ignore Ctrl-C in this process: the one that started it ends it when its work is saved."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ignore Ctrl-C and SIGTERM here: the process that started this one ends it when all is saved.
+
+    Both may be sent to all processes of a run at once.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _ahead(

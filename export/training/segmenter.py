@@ -31,7 +31,7 @@ from gcar_export.scenes.expert_pictures import (
 from gcar_export.scenes.picture_pool import pooled
 from gcar_export.training.loop import Lesson, Schedule, learn_together
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.run_folder import RunFolder, check_device
+from gcar_export.training.run_folder import Flag, RunFolder, check_device, heeding
 from gcar_export.training.scene_stream import leave_interrupts_to_the_parent
 from gcar_export.training.segmenter_start import begin_with, with_that_of
 
@@ -246,17 +246,17 @@ def batches(
 
 
 @functools.cache
-def _held_out(count: int) -> list[tuple[Array, Array]]:
-    return [training_pair(VALIDATION_SEED, k) for k in range(count)]
+def _held_out(number: int) -> tuple[Array, Array]:
+    return training_pair(VALIDATION_SEED, number)
 
 
 @torch.no_grad()
-def validate(net: MaskUNet, options: SegmenterOptions) -> float:
+def validate(net: MaskUNet, options: SegmenterOptions, stop: Flag) -> float:
     """Mean Dice at 0.5 over held-out generated pictures."""
     net.eval()
     scores = []
-    for pair in _held_out(options.validation_pictures):
-        x, y = (torch.from_numpy(a).to(options.device) for a in pair)
+    for k in heeding(stop, range(options.validation_pictures)):
+        x, y = (torch.from_numpy(a).to(options.device) for a in _held_out(k))
         asked = y[1] > 0
         found, true = (net(x[None])[0, 0] >= 0) & asked, (y[0] >= 0.5) & asked
         both = float((found & true).sum())
@@ -314,7 +314,7 @@ def train(
         lesson: Lesson[MaskUNet, list[torch.Tensor]] = Lesson(
             batches_from,
             functools.partial(_loss, net, options, left_out),
-            lambda mean: {"dice": validate(mean, options)},
+            lambda mean, stop: {"dice": validate(mean, options, stop)},
         )
         own = dataclasses.replace(options, fold=fold)
         where = out if fold == options.fold else out / f"fold-{fold[0]}-of-{fold[1]}"

@@ -19,7 +19,7 @@ from gcar_export.training.loop import (  # noqa: E402
     learn_together,
     learning_rate,
 )
-from gcar_export.training.run_folder import RunFolder  # noqa: E402
+from gcar_export.training.run_folder import RunFolder, heeding, read_log  # noqa: E402
 from gcar_export.training.segmenter import TINY, SegmenterOptions  # noqa: E402
 
 MANIFEST = {"network": "line", "config": {}, "seed": 1}
@@ -45,7 +45,7 @@ def lesson(net, losses=None, steps=60):
 
     return Lesson(
         lambda first: range(first, steps), loss_of,
-        lambda mean: {"slope": float(mean.weight.detach())},
+        lambda mean, _: {"slope": float(mean.weight.detach())},
     )  # fmt: skip
 
 
@@ -82,6 +82,8 @@ def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
     assert one.keys() == two.keys()
     for name, value in one.items():
         np.testing.assert_array_equal(value, two[name], err_msg=name)
+    last = [read_log(tmp_path / name / "log.csv")[-1] for name in ("one", "two")]
+    assert last[0] == last[1] and last[0]["step"] == "60"
 
 
 @pytest.mark.parametrize("key", ["learning_rate", "batch", "scenes", "segmenter"])
@@ -120,7 +122,51 @@ def test_a_damaged_checkpoint_is_one_line(tmp_path, damage):
         learn(RunFolder(tmp_path, MANIFEST), net, options(steps=2), lesson(net, steps=2))
 
 
-def test_an_interrupt_saves_where_it_is_and_a_second_ends_at_once(tmp_path, capsys):
+def test_what_is_learned_is_saved_before_it_is_scored(tmp_path, capsys):
+    """An end meanwhile, whichever, costs the scores alone: the next call gives them."""
+
+    def ends(mean, _):
+        raise MemoryError
+
+    net = line()
+    torn = dataclasses.replace(lesson(net), validate=ends)
+    with pytest.raises(MemoryError):
+        learn(RunFolder(tmp_path, MANIFEST), net, options(), torn)
+    assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 60
+    assert not RunFolder(tmp_path, MANIFEST).finished(60)
+    told = capsys.readouterr().err
+    assert "min left" not in told and "scoring follows" in told and "it is scored now" in told
+    again = dataclasses.replace(lesson(net), loss_of=None)  # no step is taken
+    learn(RunFolder(tmp_path, MANIFEST), net, options(), again)
+    assert "slope" in json.loads((tmp_path / "manifest.json").read_text())["validation"]
+    assert RunFolder(tmp_path, MANIFEST).finished(60)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_scoring(tmp_path, capsys, number):
+    seen = []
+
+    def validate(mean, stop):
+        for k in heeding(stop, range(9)):
+            seen.append(k)
+            if k == 2:
+                signal.raise_signal(number)
+        return {"slope": 0.0}
+
+    net = line()
+    own = dataclasses.replace(lesson(net, steps=1), validate=validate)
+    both = [(RunFolder(tmp_path / name, MANIFEST), net, own) for name in "ab"]
+    with pytest.raises(KeyboardInterrupt):
+        learn_together(both, options(steps=1))
+    assert seen == [0, 1, 2]
+    said = capsys.readouterr().err
+    for name in "ab":
+        assert f"{tmp_path / name} is saved at step 1; the same command goes on" in said
+        assert int(load_file(tmp_path / name / "checkpoint.safetensors")["step"]) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_saves_where_it_is_and_a_second_ends_at_once(tmp_path, capsys, number):
     net = line()
     own = lesson(net)
 
@@ -129,12 +175,12 @@ def test_an_interrupt_saves_where_it_is_and_a_second_ends_at_once(tmp_path, caps
             for k in range(first, 60):
                 if k == first + 3:
                     for _ in range(times):
-                        signal.raise_signal(signal.SIGINT)
+                        signal.raise_signal(number)
                 yield k
 
         return dataclasses.replace(own, batches=batches)
 
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.signal(number, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt):
         learn(RunFolder(tmp_path, MANIFEST), net, options(), pressed(1))
     assert f"{tmp_path} is saved at step 3; the same command goes on" in capsys.readouterr().err
@@ -143,7 +189,7 @@ def test_an_interrupt_saves_where_it_is_and_a_second_ends_at_once(tmp_path, caps
     with pytest.raises(KeyboardInterrupt):
         learn(RunFolder(tmp_path, MANIFEST), net, options(save_every=50), pressed(2))
     assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 3
-    assert signal.getsignal(signal.SIGINT) == before
+    assert signal.signal(number, before) == signal.default_int_handler
 
 
 def test_a_finished_run_says_that_it_is(tmp_path, capsys):
@@ -202,7 +248,7 @@ def test_a_gradient_that_is_not_finite_moves_nothing(tmp_path):
     net = line()
     before = net.weight.detach().clone()
     torn = Lesson(lambda first: range(first, 60), lambda k: (net(torch.ones(1, 1)) / 0).sum(),
-                  lambda mean: {"slope": 0.0})  # fmt: skip
+                  lambda mean, _: {"slope": 0.0})  # fmt: skip
     learn(RunFolder(tmp_path, MANIFEST), net, options(), torn)
     torch.testing.assert_close(net.weight.detach(), before)
 

@@ -12,6 +12,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.center_map import decode
 from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.render import path_and_depth, path_lengths
+from gcar_export.training import paper
 from gcar_export.training.checkpoint import read_manifest
 from gcar_export.training.losses import depth_loss, depth_weight, silog
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
@@ -196,12 +197,27 @@ def test_training_resumes_to_the_bit(tmp_path):
     best = [read_manifest(tmp_path / k / "best.safetensors")["best"] for k in ("whole", "parts")]
     assert best[0]["step"] == best[1]["step"] in (2, 4)
     log = read_log(tmp_path / "whole/log.csv")
+    assert read_log(tmp_path / "parts/log.csv") == log
     assert [r["step"] for r in log] == ["2", "2", "4", "4"], "a row a view"
     errors = {
         step: np.mean([float(r["depth_error"]) for r in log if r["step"] == step])
         for step in ("2", "4")
     }
     assert errors[str(best[0]["step"])] == min(errors.values())
+
+
+def test_what_is_learned_is_saved_before_it_is_scored(tmp_path, monkeypatch):
+    def ends(*_):
+        raise MemoryError
+
+    one = dataclasses.replace(PRESETS["tiny"], steps=1, decay_steps=1)
+    with monkeypatch.context() as torn, pytest.raises(MemoryError):
+        torn.setattr(paper, "validate", ends)
+        train(tmp_path, one, CONFIGS["tiny"])
+    assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 1
+    monkeypatch.setattr(paper, "batch_loss", ends)  # no step is taken
+    train(tmp_path, one, CONFIGS["tiny"])
+    assert {r["step"] for r in read_log(tmp_path / "log.csv")} == {"1"}
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ from gcar_export.training.multi import (
     train,
 )
 from gcar_export.training.networks.sparse import SparsePredictor
-from gcar_export.training.run_folder import load_weights
+from gcar_export.training.run_folder import load_weights, read_log
 from gcar_export.training.scene_stream import in_order
 from gcar_export.training.warm_start import OWN_LICENSE, license_of
 
@@ -142,6 +142,22 @@ def test_training_resumes_to_the_bit(tmp_path):
     assert a.keys() == b.keys()
     for key in a:
         assert torch.equal(a[key], b[key]), key
+    logs = [read_log(tmp_path / k / "log.csv") for k in ("whole", "parts")]
+    assert [r for r in logs[1] if int(r["step"]) % options.save_every == 0] == logs[0]
+
+
+def test_what_is_learned_is_saved_before_it_is_scored(tmp_path, monkeypatch):
+    def ends(*_):
+        raise MemoryError
+
+    one = dataclasses.replace(PRESETS["tiny"], steps=1, decay_steps=1, validation_scenes=1)
+    with monkeypatch.context() as torn, pytest.raises(MemoryError):
+        torn.setattr(multi, "validate", ends)
+        train(tmp_path, one, TINY)
+    assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 1
+    monkeypatch.setattr(multi, "scene_loss", ends)  # no step is taken
+    train(tmp_path, one, TINY)
+    assert [r["step"] for r in read_log(tmp_path / "log.csv")] == ["1"]
 
 
 def _children(pid):
@@ -174,9 +190,11 @@ def test_replicas_end_with_their_parent(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("replicas", [1, 2])
-def test_an_interrupt_of_all_processes_saves_the_run(tmp_path, replicas):
-    """Ctrl-C in a terminal reaches the replicas as well."""
+@pytest.mark.parametrize(
+    ("replicas", "number"), [(1, signal.SIGINT), (2, signal.SIGINT), (2, signal.SIGTERM)]
+)
+def test_an_interrupt_of_all_processes_saves_the_run(tmp_path, replicas, number):
+    """Ctrl-C in a terminal, and what a scheduler sends, reach the replicas as well."""
     code = (
         "import dataclasses, pathlib, sys\nfrom gcar_export.training.multi import *\n"
         "if __name__ == '__main__':\n"
@@ -192,7 +210,7 @@ def test_an_interrupt_of_all_processes_saves_the_run(tmp_path, replicas):
     ) as parent:  # fmt: skip
         for text in parent.stderr:
             if text.startswith("step "):
-                os.killpg(parent.pid, signal.SIGINT)
+                os.killpg(parent.pid, number)
                 break
         said = parent.stderr.read()
         assert parent.wait(60) != 0
