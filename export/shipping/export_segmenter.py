@@ -32,10 +32,11 @@ from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.parity import PARITY
-from gcar_export.training.checkpoint import network_of, read_manifest
+from gcar_export.training.checkpoint import network_of
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.segmenter_start import begin_with, devices_of
+from gcar_export.training.terms import license_of, trained_as
 
 #: seed of the pictures that parity is checked on
 PARITY_SEED = 70_002
@@ -213,17 +214,8 @@ def export_segmenter(
 
 
 def _training(checkpoint: Path, devices: Path) -> dict[str, Any]:
-    """Say what both were trained on, as the manifests beside them do."""
-    if checkpoint.suffix == ".onnx":
-        training = dict(json.loads(checkpoint.with_suffix(".json").read_text())["training"])
-    else:
-        training = json.loads((checkpoint.parent / "manifest.json").read_text())
-    if devices.suffix == ".onnx":
-        told = json.loads(devices.with_suffix(".json").read_text())
-        training["devices"] = told["training"]["devices"]
-    else:
-        training["devices"] = read_manifest(devices)
-    return training
+    """Say what both were trained on, as the manifests or specs beside them do."""
+    return trained_as(checkpoint) | {"devices": trained_as(devices, devices=True)}
 
 
 def _write_spec(training: Mapping[str, Any], out: Path, net: torch.nn.Module) -> None:
@@ -237,7 +229,7 @@ def _write_spec(training: Mapping[str, Any], out: Path, net: torch.nn.Module) ->
         "opset": OPSET,
         "ir_version": IR_VERSION,
         "training": training,
-        "license": "Apache-2.0; trained on " + training["data"],
+        "license": license_of(training),
         "sha256": hashlib.sha256(data).hexdigest(),
         "bytes": len(data),
         "parameters": sum(p.numel() for p in net.parameters()),

@@ -14,6 +14,7 @@ from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.kinds import PAPER, PREDICTORS
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.task_check import REACH_PIXELS, scores
+from gcar_export.training.terms import license_text
 
 #: seed of the pictures that a segmenter is asked for; no training or validation draws from it
 PICTURE_SEED = 80_002
@@ -32,6 +33,7 @@ def verify_model(path: Path, scenes: int) -> str:
     from gcar_deploy.cli.model_card import card
 
     model = read_model(path, (*PREDICTORS.values(), SEGMENTER))
+    license_text(model.name, model.spec, "")
     found: dict[str, list[float]] = {}
     named = "Dice at 0.5 on the hull"
     if model.kind == SEGMENTER.name:

@@ -33,8 +33,9 @@ from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.training.loop import Lesson, learn
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.run_folder import Flag, RunFolder, heeding
-from gcar_export.training.segmenter import changes, real_pictures
-from gcar_export.training.segmenter_start import devices_of, vessels_sha256, with_that_of
+from gcar_export.training.segmenter import changes, real_named, real_pictures
+from gcar_export.training.segmenter_start import devices_of, vessels_sha256
+from gcar_export.training.terms import begun
 
 #: pictures of this seed are for choosing, never for training
 VALIDATION_SEED = 90_003
@@ -202,8 +203,9 @@ def train(
             "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
             "segmenter": pictures.sha256,
             "warm_start": first,
-            "data": with_that_of(begin_from, data, devices=True),
             "validation_seed": VALIDATION_SEED,
+            **begun(begin_from, data, devices=True),
+            **real_named(options.real, real),
         },
     )
     lesson: Lesson[LineNet, Batch] = Lesson(

@@ -95,8 +95,10 @@ class RunFolder:
         now = json.loads(json.dumps(self.manifest))
         pairs = {key: (before.get(key), now.get(key)) for key in FIXED}
         old, new = before.get("options") or {}, now.get("options") or {}
-        # A run of an earlier version may lack an option that there is by now.
+        # A run of an earlier version may lack an option that there is by now, and its pictures.
         pairs |= {key: (old[key], new[key]) for key in new if key in old and key not in FREE}
+        if "real" in before:  # the pictures themselves say more than their folder's name
+            pairs["real"] = before["real"], now.get("real")
         for key, (was, wanted) in pairs.items():
             if was != wanted:
                 raise UsageError(
@@ -389,4 +391,6 @@ def _kept(value: torch.Tensor) -> torch.Tensor:
 def _shown(key: str, value: Any) -> str:
     if key == "labels":
         return "no labels" if not value else f"{len(value)} label volumes ({', '.join(value)})"
+    if key == "real" and isinstance(value, dict):
+        return f"{len(value)} real pictures ({', '.join(value)[:60]})"
     return f"{key} = {value!r}"

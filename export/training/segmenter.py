@@ -27,13 +27,15 @@ from gcar_export.scenes.expert_pictures import (
     expert_pictures,
     fold_edges,
     folds,
+    named,
 )
 from gcar_export.scenes.picture_pool import pooled
 from gcar_export.training.loop import Lesson, Schedule, learn_together
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
 from gcar_export.training.run_folder import Flag, RunFolder, check_device, heeding
 from gcar_export.training.scene_stream import leave_interrupts_to_the_parent
-from gcar_export.training.segmenter_start import begin_with, with_that_of
+from gcar_export.training.segmenter_start import begin_with
+from gcar_export.training.terms import begun
 
 #: pictures with this seed are for choosing and reporting, never for training
 VALIDATION_SEED = 90_002
@@ -281,6 +283,11 @@ def real_pictures(real: str, fold: tuple[int, int]) -> tuple[ExpertPicture, ...]
     return folds(expert_pictures(Path(real)), number, of)[0]
 
 
+def real_named(real: str, used: Sequence[ExpertPicture]) -> dict[str, Any]:
+    """Return what a manifest says of the real pictures that are trained on."""
+    return {"real": named(Path(real), used)} if used else {}
+
+
 def train(
     out: Path, options: SegmenterOptions, *, minutes: float | None = None, workers: int = 1,
     begin_from: Path | None = None, pool: Path | None = None,
@@ -318,7 +325,9 @@ def train(
         )
         own = dataclasses.replace(options, fold=fold)
         where = out if fold == options.fold else out / f"fold-{fold[0]}-of-{fold[1]}"
-        pupils.append((RunFolder(where, _manifest(net, own, started, begin_from)), net, lesson))
+        used = [one for k, one in enumerate(real) if k not in left_out]
+        manifest = _manifest(net, own, started, begin_from) | real_named(options.real, used)
+        pupils.append((RunFolder(where, manifest), net, lesson))
     learn_together(pupils, options, minutes)
 
 
@@ -350,7 +359,7 @@ def _manifest(
         "seed": options.seed,
         "options": dataclasses.asdict(options) | {"real": Path(options.real).name},
         "warm_start": started,
-        "data": with_that_of(first, data),
+        **begun(first, data),
         "validation_seed": VALIDATION_SEED,
     }
 

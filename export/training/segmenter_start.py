@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,9 @@ import numpy as np
 import torch
 
 from gcar_deploy.errors import ModelError
-from gcar_export.training.checkpoint import WEIGHTS, best_weights, read_manifest, read_tensors
+from gcar_export.training.checkpoint import WEIGHTS, best_weights, read_tensors
 from gcar_export.training.networks.line_net import LineNet
 from gcar_export.training.networks.mask_unet import MaskUNet
-
-#: how the licence of what this project trains begins
-OWN = "Apache-2.0"
 
 
 def begin_with(net: MaskUNet, path: Path) -> str:
@@ -66,37 +62,6 @@ def devices_of(net: LineNet, model: Path) -> str:
     except RuntimeError:
         raise ModelError(f"{model.name} holds no network of lines of this size") from None
     return hashlib.sha256(model.read_bytes()).hexdigest()
-
-
-def with_that_of(first: Path | None, data: str, devices: bool = False) -> str:
-    """Say what a network was trained on, and what its first weights were, part by part.
-
-    Parameters
-    ----------
-    first : checkpoint or ONNX model that its weights began from; None for random ones
-    data : what it is trained on itself
-    devices : whether it is the network of lines
-
-    Raises
-    ------
-    ModelError
-        The manifest, or the spec of the model, is missing or says nothing of it.
-    """
-    if first is None:
-        return data
-    terms = []
-    try:
-        if first.suffix == ".onnx":
-            spec = json.loads(first.with_suffix(".json").read_text(encoding="utf-8"))
-            training = spec["training"]["devices"] if devices else spec["training"]
-            if not str(spec.get("license", OWN)).startswith(OWN):
-                terms.append(f"first weights under {spec['license']}")
-        else:
-            training = read_manifest(first)
-        before = str(training["data"]).split("; ")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ModelError(f"{first}: what it was trained on is not said ({error})") from None
-    return "; ".join(dict.fromkeys([*data.split("; "), *before, *terms]))
 
 
 def _graph(model: Path) -> Any:

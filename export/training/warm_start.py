@@ -17,6 +17,7 @@ from gcar_deploy.errors import ModelError
 from gcar_deploy.models.spec import ModelFile, read_model
 from gcar_deploy.predict.kinds import MULTI
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
+from gcar_export.training.terms import license_text
 
 _PREFIX = "net."
 #: licence of what was trained on no label volume
@@ -51,7 +52,7 @@ def inherited(model: ModelFile) -> dict[str, Any]:
             same = labels.get(name, digest) == digest
             labels[name if same else f"{name} ({digest[:8]})"] = digest
     terms = list(training.get("licenses_before", ()))
-    told = str(model.spec.get("license", OWN_LICENSE))
+    told = license_text(model.name, model.spec, OWN_LICENSE)
     if told not in (license_of(training), *terms):
         terms.append(told)
     return {"warm_start": model.sha256, "labels_before": labels, "licenses_before": terms}

@@ -39,7 +39,7 @@ from gcar_export.training.devices import (  # noqa: E402
     varied,
 )
 from gcar_export.training.networks.line_net import LineNet, no_vessel  # noqa: E402
-from gcar_export.training.segmenter_start import devices_of, vessels_sha256, with_that_of  # noqa: E402
+from gcar_export.training.segmenter_start import devices_of, vessels_sha256  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -224,27 +224,6 @@ def test_a_training_goes_on_from_a_model(tmp_path):
     assert manifest["warm_start"] == hashlib.sha256(KIND.path.read_bytes()).hexdigest()
     with pytest.raises(ModelError, match=r"gcp-multi\.onnx holds no network of lines"):
         devices_of(LineNet(), KIND.path.with_name("gcp-multi.onnx"))
-
-
-def test_what_the_first_weights_were_trained_on_stays_said(tmp_path):
-    spec = json.loads(KIND.path.with_suffix(".json").read_text())
-    own, real = spec["training"]["data"].split("; ")
-    assert (
-        with_that_of(KIND.path, own)
-        == f"{own}; {real}"
-        == with_that_of(KIND.path, f"{own}; {real}")
-    )
-    lines = with_that_of(KIND.path, "lines", devices=True)
-    assert lines == f"lines; {spec['training']['devices']['data']}"
-    assert with_that_of(None, own) == own
-    (tmp_path / "manifest.json").write_text(json.dumps({"config": {}, "data": "others"}))
-    assert with_that_of(tmp_path / "checkpoint.safetensors", own) == f"{own}; others"
-    (tmp_path / "m.json").write_text(json.dumps(spec | {"license": "CC-BY-NC-4.0"}))
-    assert (
-        with_that_of(tmp_path / "m.onnx", own) == f"{own}; {real}; first weights under CC-BY-NC-4.0"
-    )
-    with pytest.raises(ModelError, match=r"n\.onnx: what it was trained on is not said"):
-        with_that_of(tmp_path / "n.onnx", own)
 
 
 def test_size_of_the_network():

@@ -257,7 +257,7 @@ def test_a_training_may_begin_from_a_model(tmp_path):
 
 def _generation(folder, parent, monkeypatch, labels=None):
     """Card of a model that was trained on from another one."""
-    file = types.SimpleNamespace(spec=parent, sha256="0" * 64, kind="multi")
+    file = types.SimpleNamespace(spec=parent, name="m", sha256="0" * 64, kind="multi")
     monkeypatch.setattr(multi, "predictor_of", lambda _: (SparsePredictor(TINY), file))
     train(folder, PRESETS["tiny"], TINY, until=0.0, warm_start=folder, labels=[None] * bool(labels),
           label_hashes=labels)  # fmt: skip
