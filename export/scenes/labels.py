@@ -14,6 +14,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
 from nibabel.spatialimages import HeaderDataError
@@ -37,6 +38,8 @@ CENTRED_WITHIN_MM = 2.0
 #: a part with a smaller share of the largest one's volume is a crumb and no tree of its own; the
 #: smallest right artery met has 0.09
 LEAST_TREE = 0.03
+#: of a voxel that is vessel, or probability that it is, from which on it counts as vessel
+SHARE = 0.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,8 +198,9 @@ _DAMAGE = (
 def read_label(path: str | Path) -> LabelVolume:
     """Read a label volume by its file name: .nii, .nii.gz, .nrrd, .mha, .mhd or ASOCA .npz.
 
-    Any value above 0 is vessel; the ``occupancy`` array of an .npz (uint8, 0 .. 255) keeps
-    its shares. Wide empty borders are cropped.
+    Any value above 0 is vessel. Shares (floating-point values, all within 0 .. 1, not only these
+    two) are vessel from ``SHARE`` on, which is said on stderr; the ``occupancy`` array of an .npz
+    (uint8, 0 .. 255) keeps its own. Wide empty borders are cropped.
 
     Raises
     ------
@@ -213,7 +217,9 @@ def read_label(path: str | Path) -> LabelVolume:
             label = _read_npz(path, case)
         else:
             array, affine = _read_any(path, name)
-            label = from_array(array > 0, affine, case)
+            if array.ndim != 3:
+                raise UsageError(f"{path}: a label volume has 3 axes, this has {array.ndim}")
+            label = from_array(_vessel(array, path), affine, case)
     except _DAMAGE as error:
         reason = (str(error).splitlines() or [""])[0].replace(str(path), "it")[:200]
         raise UsageError(f"{path}: cannot be read ({reason or type(error).__name__})") from None
@@ -255,6 +261,16 @@ def from_array(occupancy: Array, index2ras: Array, name: str = "label") -> Label
     x, y, z = array.shape
     grid = Grid(center_mm=tuple(center.tolist()), size_mm=tuple(size.tolist()), shape=(x, y, z))
     return LabelVolume(occupancy=np.ascontiguousarray(array), grid=grid, name=name)
+
+
+def _vessel(array: Array, path: Path) -> Array:
+    """Voxels that are vessel, bool."""
+    if np.issubdtype(array.dtype, np.floating):
+        shares = ((array > 0) & (array < 1)).any()
+        if shares and not ((array < 0) | (array > 1)).any():  # NaN is neither
+            click.echo(f"{path} holds shares 0 .. 1: from {SHARE} on a voxel is vessel", err=True)
+            return np.asarray(array >= SHARE)
+    return np.asarray(array > 0)
 
 
 def _read_any(path: Path, name: str) -> tuple[Array, Array]:

@@ -106,6 +106,30 @@ def test_all_formats_read_the_same(tmp_path):
         assert np.allclose(label.grid.lower_mm, labels[0].grid.lower_mm)
 
 
+def test_shares_are_vessel_from_a_half_on_and_this_is_said(tmp_path, capsys):
+    """A probability map, or the truth of a simulated case: above 0 it is far too wide."""
+    shares = ndimage.gaussian_filter(two_trees().astype(np.float32), 1.0)
+    assert (shares > 0).sum() > 2 * (shares >= 0.5).sum()
+    nibabel.save(nibabel.Nifti1Image(shares, RAS), tmp_path / "map.nii.gz")
+    label = read_label(tmp_path / "map.nii.gz")
+    assert label.volume_mm3 == pytest.approx((shares >= 0.5).sum() / 8)
+    assert (
+        "map.nii.gz holds shares 0 .. 1: from 0.5 on a voxel is vessel" in capsys.readouterr().err
+    )
+    for name, factor in (("mask", 1.0), ("named", 3.0)):  # labels as numbers, in whatever type
+        array = factor * two_trees().astype(np.float32)
+        nibabel.save(nibabel.Nifti1Image(array, RAS), tmp_path / f"{name}.nii.gz")
+        assert read_label(tmp_path / f"{name}.nii.gz").volume_mm3 == two_trees().sum() / 8
+    assert not capsys.readouterr().err
+
+
+def test_a_volume_of_other_axes_is_named_by_its_path(tmp_path):
+    flat = np.ones((4, 4, 4, 2), np.uint8)
+    nibabel.save(nibabel.Nifti1Image(flat, RAS), tmp_path / "4d2.nii.gz")
+    with pytest.raises(UsageError, match=r"/4d2\.nii\.gz: a label volume has 3 axes, this has 4"):
+        read_label(tmp_path / "4d2.nii.gz")
+
+
 @pytest.mark.parametrize(
     ("name", "blob"),
     [
