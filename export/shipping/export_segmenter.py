@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -169,10 +170,8 @@ def export_segmenter(
     Raises
     ------
     ModelError
-        The ONNX file says something else than the checkpoint; the file is taken away.
+        The ONNX file says something else than the checkpoint; what was at ``out`` stays.
     """
-    import onnx
-
     devices = devices or shipped()
     net = _Deployed(load_segmenter_checkpoint(checkpoint), load_device_checkpoint(devices)).eval()
     example = torch.zeros(1, INPUT["channels"], 8 * STRIDE, 9 * STRIDE)
@@ -189,28 +188,48 @@ def export_segmenter(
         output_names=list(OUTPUTS),
         dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols}, {0: count}, {0: count}),
     )
+    partial = out.with_name(f"{out.stem}.partial.onnx")
+    new = not out.parent.exists()
     out.parent.mkdir(parents=True, exist_ok=True)
-    # That of a model which is replaced would be refused with the new one.
-    golden_path(out).unlink(missing_ok=True)
-    program.save(str(out), external_data=False)
-    model = onnx.load(str(out))
+    # Of a run that was cut off here; it would be refused with another model.
+    golden_path(partial).unlink(missing_ok=True)
+    try:
+        _write(program, partial)
+        _write_spec(_training(checkpoint, devices), partial, out.stem, net)
+        worst = _largest_difference(net, partial, pictures)
+        if worst > PARITY:
+            raise ModelError(
+                f"{out.name} differs from its checkpoint by {worst:.1e} (at most {PARITY:g})"
+            )
+        write_golden(partial, force=True)
+        for made, place in zip(_files(partial), _files(out), strict=True):
+            os.replace(made, place)
+    finally:
+        for path in _files(partial):
+            path.unlink(missing_ok=True)
+        if new and not any(out.parent.iterdir()):
+            out.parent.rmdir()
+    return worst
+
+
+def _files(model: Path) -> tuple[Path, Path, Path]:
+    """Return what one model consists of."""
+    return golden_path(model), model.with_suffix(".json"), model
+
+
+def _write(program: Any, path: Path) -> None:
+    """Write the graph without what is of no use to a host."""
+    import onnx
+
+    program.save(str(path), external_data=False)
+    model = onnx.load(str(path))
     model.ir_version = IR_VERSION
     for node in model.graph.node:
         del node.metadata_props[:]
         node.doc_string = ""
     del model.metadata_props[:]
     onnx.checker.check_model(model, full_check=True)
-    onnx.save(model, str(out))
-    _write_spec(_training(checkpoint, devices), out, net)
-    worst = _largest_difference(net, out, pictures)
-    if worst > PARITY:
-        for path in (out, out.with_suffix(".json")):
-            path.unlink(missing_ok=True)
-        raise ModelError(
-            f"{out.name} differs from its checkpoint by {worst:.1e} (at most {PARITY:g})"
-        )
-    write_golden(out, force=True)
-    return worst
+    onnx.save(model, str(path))
 
 
 def _training(checkpoint: Path, devices: Path) -> dict[str, Any]:
@@ -218,11 +237,11 @@ def _training(checkpoint: Path, devices: Path) -> dict[str, Any]:
     return trained_as(checkpoint) | {"devices": trained_as(devices, devices=True)}
 
 
-def _write_spec(training: Mapping[str, Any], out: Path, net: torch.nn.Module) -> None:
+def _write_spec(training: Mapping[str, Any], out: Path, name: str, net: torch.nn.Module) -> None:
     data = out.read_bytes()
     spec = {
         "schema": "gcar-model/1",
-        "name": out.stem,
+        "name": name,
         "kind": KIND.name,
         "inputs": dict(INPUT),
         "outputs": list(OUTPUTS),

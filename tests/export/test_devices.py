@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from gcar_export.scenes.device_pictures import (  # noqa: E402
 )
 from gcar_export.scenes.drawn_devices import drawn_devices  # noqa: E402
 from gcar_export.scenes.expert_pictures import expert_pictures  # noqa: E402
+from gcar_export.shipping import export_segmenter as exporting  # noqa: E402
 from gcar_export.shipping.export_segmenter import (  # noqa: E402
     export_segmenter,
     load_device_checkpoint,
@@ -188,11 +190,13 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     train(tmp_path / "run", TINY, pool=tmp_path / "pool")
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["step"] == 3 and 0 <= manifest["validation"]["found"] <= 1
-    out = tmp_path / "segmenter.onnx"
+    out = tmp_path / "out" / "segmenter.onnx"
     checkpoint = tmp_path / "run" / "checkpoint.safetensors"
     assert export_segmenter(KIND.path, out, 2, checkpoint) < 1e-4
     spec = json.loads(out.with_suffix(".json").read_text())
-    assert spec["training"]["devices"]["step"] == 3
+    assert spec["training"]["devices"]["step"] == 3 and spec["name"] == "segmenter"
+    names = {"segmenter.onnx", "segmenter.json", "segmenter.golden.npz"}
+    assert {path.name for path in out.parent.iterdir()} == names
     channels = np.random.default_rng(0).normal(size=(3, 96, 112)).astype(np.float32)
     lines = _lines(np.random.default_rng(2))
     new = open_segmenter(out, threads=1)
@@ -224,6 +228,19 @@ def test_a_training_goes_on_from_a_model(tmp_path):
     assert manifest["warm_start"] == hashlib.sha256(KIND.path.read_bytes()).hexdigest()
     with pytest.raises(ModelError, match=r"gcp-multi\.onnx holds no network of lines"):
         devices_of(LineNet(), KIND.path.with_name("gcp-multi.onnx"))
+
+
+@pytest.mark.slow
+def test_a_model_is_replaced_by_one_that_was_proved(tmp_path, monkeypatch):
+    out = tmp_path / "segmenter.onnx"
+    for path in exporting._files(KIND.path):
+        shutil.copy(path, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(exporting, "PARITY", -1.0)
+    for place in (out, tmp_path / "new" / "m.onnx"):
+        with pytest.raises(ModelError, match="differs from its checkpoint"):
+            export_segmenter(KIND.path, place, 1)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_size_of_the_network():
