@@ -117,12 +117,15 @@ def train_segmenter(
 @click.command("train-devices")
 @_on_pictures
 @click.option("--warm-start", type=FILE, help="ONNX model whose device network goes on.")
+@click.option("--segmenter-model", type=FILE, help="ONNX segmenter of your own that finds lines.")
 def train_devices(
-    out: Path, pool: Path | None, warm_start: Path | None, minutes: float | None, **given: Any
-) -> None:
+    out: Path, pool: Path | None, warm_start: Path | None, segmenter_model: Path | None,
+    minutes: float | None, **given: Any,
+) -> None:  # fmt: skip
     """Train the network that tells catheters, leads and wires along lines; stop and go on at will.
 
-    It looks along the lines that the segmenter that comes along finds, which stays as it is.
+    It looks along the lines that the segmenter finds, the one that comes along or your own, which
+    stays as it is.
     Without options: one CPU core for two hours, most of them to draw pictures; none are real.
 
     Example: gcar-export train-devices --out runs/d --real xca_masks --pictures 3400
@@ -130,4 +133,7 @@ def train_devices(
     from gcar_export.training import devices as training
 
     options = training.chosen({k: v for k, v in given.items() if v is not None})
-    training.train(out, options, minutes=minutes, pool=pool, begin_from=warm_start)
+    training.train(
+        out, options, minutes=minutes, pool=pool, begin_from=warm_start,
+        segmenter_model=segmenter_model,
+    )  # fmt: skip

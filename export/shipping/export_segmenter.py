@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import click
 import numpy as np
 import torch
 
@@ -36,7 +37,7 @@ from gcar_export.shipping.parity import PARITY
 from gcar_export.training.checkpoint import network_of
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
-from gcar_export.training.segmenter_start import begin_with, devices_of
+from gcar_export.training.segmenter_start import begin_with, devices_of, vessels_sha256
 from gcar_export.training.terms import license_of, trained_as
 
 #: seed of the pictures that parity is checked on
@@ -154,6 +155,8 @@ def export_segmenter(
 ) -> float:
     """Write ``out`` (.onnx), its spec (.json) and its golden case.
 
+    A network of lines that was trained on those of another segmenter is said on stderr.
+
     Parameters
     ----------
     checkpoint : of the segmenter, or an ONNX model whose segmenter is taken as it is
@@ -195,7 +198,8 @@ def export_segmenter(
     golden_path(partial).unlink(missing_ok=True)
     try:
         _write(program, partial)
-        _write_spec(_training(checkpoint, devices), partial, out.stem, net)
+        training = _training(checkpoint, devices)
+        _write_spec(training, partial, out.stem, net)
         worst = _largest_difference(net, partial, pictures)
         if worst > PARITY:
             raise ModelError(
@@ -204,12 +208,26 @@ def export_segmenter(
         write_golden(partial, force=True)
         for made, place in zip(_files(partial), _files(out), strict=True):
             os.replace(made, place)
+        _say_of_others_lines(training["devices"].get("segmenter"), devices, out)
     finally:
         for path in _files(partial):
             path.unlink(missing_ok=True)
         if new and not any(out.parent.iterdir()):
             out.parent.rmdir()
     return worst
+
+
+def _say_of_others_lines(trained_on: str | None, devices: Path, out: Path) -> None:
+    """Say that the network of lines knows those of another segmenter, if it does."""
+    own = vessels_sha256(out)
+    together = devices.suffix == ".onnx" and vessels_sha256(devices) == own
+    if trained_on is not None and trained_on != own and not together:
+        click.echo(
+            f"note: the device network of {devices} was trained on lines of another segmenter "
+            f"({trained_on[:12]}) than this one ({own[:12]}); train-devices --segmenter-model "
+            f"{out} trains one for it",
+            err=True,
+        )
 
 
 def _files(model: Path) -> tuple[Path, Path, Path]:

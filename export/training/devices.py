@@ -18,7 +18,7 @@ import torch
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.imaging.line_strips import LinePoints, backwards, mirrored
-from gcar_deploy.imaging.net import KIND, load_segmenter
+from gcar_deploy.imaging.net import KIND, open_segmenter
 from gcar_export.scenes.device_pictures import (
     DEVICE,
     NO_VESSEL,
@@ -115,10 +115,7 @@ class Pictures:
         self, options: DeviceOptions, pool: Path, model: Path, real: tuple[ExpertPicture, ...]
     ) -> None:
         self.options, self.pool, self.real = options, pool, real
-        segmenter = load_segmenter("net", 1)
-        if segmenter is None:
-            raise UsageError("lines are found by the segmenter, and none is installed")
-        self.segmenter = segmenter
+        self.segmenter = open_segmenter(model, threads=1)
         self.sha256 = vessels_sha256(model)
         self.stream = generator(self.sha256, real)
 
@@ -172,8 +169,12 @@ def train(
     minutes: float | None = None,
     pool: Path | None = None,
     begin_from: Path | None = None,
+    segmenter_model: Path | None = None,
 ) -> None:
     """Train or go on training in ``out``; stop after ``minutes`` if given.
+
+    Lines are those that ``segmenter_model`` finds, an ONNX file; by default the one that comes
+    along.
 
     The decay is a function of the step, so a run cut short has not settled: ``finish`` it by a
     call with fewer ``steps``. Pictures are kept in ``pool``, by default in ``out``. The first
@@ -182,14 +183,15 @@ def train(
     Raises
     ------
     ModelError
-        ``begin_from`` holds no device network of this size.
+        ``begin_from`` holds no device network of this size, or ``segmenter_model`` is none.
     """
     cv2.setNumThreads(1)
     torch.manual_seed(options.seed)
-    if KIND.path is None:
+    segmenter_model = segmenter_model or KIND.path
+    if segmenter_model is None:
         raise UsageError("lines are found by the segmenter, and none is installed")
     real = real_pictures(options.real, options.fold)
-    pictures = Pictures(options, pool or out / "pool", KIND.path, real)
+    pictures = Pictures(options, pool or out / "pool", segmenter_model, real)
     net = LineNet(LineNetConfig()).train()
     first = None if begin_from is None else devices_of(net, begin_from)
     data = "gcar_export.scenes.device_pictures"

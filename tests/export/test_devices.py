@@ -11,6 +11,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the export extra")
 
+from safetensors.torch import save_file  # noqa: E402
+
 from gcar_deploy.errors import ModelError, UsageError  # noqa: E402
 from gcar_deploy.imaging.line_strips import POINT, LinePoints, near_points  # noqa: E402
 from gcar_deploy.imaging.net import KIND, load_segmenter, open_segmenter  # noqa: E402
@@ -32,6 +34,7 @@ from gcar_export.shipping import export_segmenter as exporting  # noqa: E402
 from gcar_export.shipping.export_segmenter import (  # noqa: E402
     export_segmenter,
     load_device_checkpoint,
+    load_segmenter_checkpoint,
 )
 from gcar_export.training.devices import (  # noqa: E402
     TINY,
@@ -182,7 +185,7 @@ def test_options():
 
 
 @pytest.mark.slow
-def test_from_training_to_the_model(segmenter, tmp_path):
+def test_from_training_to_the_model(segmenter, tmp_path, capsys):
     """It goes on where it stopped; in the model the vessels stay to the bit."""
     short = dataclasses.replace(TINY, steps=2)
     train(tmp_path / "run", short, pool=tmp_path / "pool")
@@ -199,6 +202,7 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     assert {path.name for path in out.parent.iterdir()} == names
     channels = np.random.default_rng(0).normal(size=(3, 96, 112)).astype(np.float32)
     lines = _lines(np.random.default_rng(2))
+    assert "another segmenter" not in capsys.readouterr().err
     new = open_segmenter(out, threads=1)
     assert new.session.check_golden() < 1e-6
     before, after = segmenter.look(channels), new.look(channels)
@@ -213,6 +217,31 @@ def test_from_training_to_the_model(segmenter, tmp_path):
     same = open_segmenter(again, threads=1)
     np.testing.assert_allclose(same.devices(lines), new.devices(lines), atol=1e-5)
     assert json.loads(again.with_suffix(".json").read_text())["training"] == spec["training"]
+
+
+@pytest.mark.slow
+def test_a_device_network_belongs_to_a_segmenter(tmp_path, capsys):
+    """Of another one it is said; one is trained for one's own."""
+    net = load_segmenter_checkpoint(KIND.path)
+    manifest = {"network": "mask-unet", "config": dataclasses.asdict(net.config), "data": ""}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    weights = {f"net.{name}": 1.001 * value for name, value in net.state_dict().items()}
+    save_file(weights, tmp_path / "own.safetensors")
+    own = tmp_path / "own.onnx"
+    export_segmenter(tmp_path / "own.safetensors", own, 1)
+    said = capsys.readouterr().err
+    assert f"train-devices --segmenter-model {own} trains one for it" in said
+    train(tmp_path / "run", TINY, segmenter_model=own)
+    trained = tmp_path / "run" / "checkpoint.safetensors"
+    kept = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert kept["segmenter"] == vessels_sha256(own) != vessels_sha256(KIND.path)
+    capsys.readouterr()
+    export_segmenter(own, tmp_path / "both.onnx", 1, trained)
+    assert "another segmenter" not in capsys.readouterr().err
+    with pytest.raises(UsageError, match="segmenter = "):
+        train(tmp_path / "run", TINY)
+    export_segmenter(KIND.path, tmp_path / "wrong.onnx", 1, tmp_path / "both.onnx")
+    assert "another segmenter" in capsys.readouterr().err
 
 
 @pytest.mark.slow
