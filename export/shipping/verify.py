@@ -50,7 +50,8 @@ def verify_model(path: Path, scenes: int) -> str:
     lines = card(model)
     worst = session.check_golden()
     lines.append(
-        "no golden case beside it"
+        "warning: no golden case beside it: only its form was checked, not that it says what it "
+        "said when it was made"
         if worst is None
         else f"golden case: largest difference {worst:.1e}"
     )

@@ -30,7 +30,7 @@ def start(
     Parameters
     ----------
     out : folder of the run; a run that is there goes on
-    network : ``multi`` or ``single``
+    network : ``multi`` or ``paper``
     preset : ``cpu``, ``gpu``, ``tune`` (multi alone) or ``tiny``
     steps, decay_steps, learning_rate, seed : replace the preset's
     minutes : stop after so long
@@ -50,7 +50,7 @@ def start(
     if network not in NETWORKS:
         raise UsageError(f"network {network!r} is none of {', '.join(NETWORKS)}")
     if network == "paper" and (preset == "tune" or warm_start is not None):
-        raise UsageError("network single starts from random weights: no preset tune, no warm start")
+        raise UsageError("network paper starts from random weights: no preset tune, no warm start")
     trees: list[LabelTree] = []
     hashes: dict[str, str] = {}
     if labels is not None:

@@ -179,6 +179,7 @@ def test_a_point_is_seen_with_its_own_line_alone():
 
 def test_options():
     assert chosen({"fold": "1/2", "steps": 8}).fold == (1, 2)
+    assert chosen({"validation_pictures": 3}).validation_pictures == 3
     assert chosen({"steps": 8}).decay_steps == 8 and chosen({"steps": 8}).warmup_steps == 2
     with pytest.raises(UsageError, match="must be K/N"):
         chosen({"fold": "first"})

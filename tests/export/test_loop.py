@@ -97,7 +97,7 @@ def test_a_run_does_not_go_on_with_other_options(tmp_path, key):
 
     net = line()
     learn(RunFolder(tmp_path, manifest()), net, options(steps=1), lesson(net, steps=1))
-    RunFolder(tmp_path, manifest(steps=90, decay_steps=3, save_every=1))
+    RunFolder(tmp_path, manifest(steps=90, decay_steps=3, save_every=1, validation_pictures=1))
     with pytest.raises(UsageError, match=rf"with {key} = .*, this one has {key} = .*same {key}"):
         RunFolder(tmp_path, manifest(**{key: 0.5}))
     older = json.loads((tmp_path / "manifest.json").read_text())

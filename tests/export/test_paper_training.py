@@ -8,6 +8,7 @@ import torch
 from safetensors.torch import load_file
 from scipy.spatial import cKDTree
 
+from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.predict.center_map import decode
 from gcar_export.scenes.capsules import Capsules
@@ -27,6 +28,7 @@ from gcar_export.training.paper import (
 )
 from gcar_export.training.paper_dataset import lumen_points, training_pictures
 from gcar_export.training.run_folder import read_log
+from gcar_export.training.train import start
 
 CONFIG = UNetConfig(pixels=64, alpha=2, width=(4, 4, 8))
 
@@ -231,6 +233,11 @@ def test_a_step_in_bfloat16_stays_near_one_in_float32(tmp_path):
     for key in a:
         if key.startswith("net."):
             torch.testing.assert_close(a[key], b[key], atol=2 * one.learning_rate, rtol=0.05)
+
+
+def test_a_refusal_names_the_network_as_the_option_does(tmp_path):
+    with pytest.raises(UsageError, match="network paper starts from random weights"):
+        start(tmp_path, "paper", "tune")
 
 
 def test_gpu_preset_is_longer_and_runs_compiled_in_bfloat16():

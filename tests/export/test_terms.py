@@ -98,6 +98,14 @@ def test_a_run_names_its_real_pictures_and_goes_on_with_them_alone(tmp_path, mon
     assert list(named(tmp_path / "real", many)) == ["4 pictures of real"]
 
 
+def test_a_model_without_its_golden_case_is_checked_in_form_alone(tmp_path):
+    for suffix in (".onnx", ".json"):
+        shutil.copy(KIND.path.with_suffix(suffix), tmp_path / f"m{suffix}")
+    said = verify_model(tmp_path / "m.onnx", 1)
+    assert "\nwarning: no golden case beside it: only its form was checked" in said
+    assert "warning" not in verify_model(KIND.path, 1)
+
+
 def test_a_licence_that_is_no_text_is_refused(tmp_path):
     for suffix in (".onnx", ".json"):
         shutil.copy(KIND.path.with_suffix(suffix), tmp_path / f"m{suffix}")
