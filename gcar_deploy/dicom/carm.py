@@ -66,6 +66,15 @@ def frame_carm(header: Header, frame: int, options: DicomOptions) -> tuple[CArm,
     return carm, notes
 
 
+def unsaid(header: Header, frame: int = 0) -> tuple[str, ...]:
+    """Name the fields of ``DicomOptions`` that must say what the header of a run does not."""
+    own = {
+        "pixel_spacing_mm": header.pair("ImagerPixelSpacing", frame),
+        "sod_mm": _own_sod(header, frame),
+    }
+    return tuple(key for key, value in own.items() if not value)
+
+
 def is_flipped(header: Header, frame: int) -> bool:
     """Whether the pixels are a mirror image of what the detector saw."""
     return header.text("FieldOfViewHorizontalFlip", frame) == "YES"
@@ -149,9 +158,7 @@ def _distances(
     if not sdd:
         raise GeometryError(f"{tag('DistanceSourceToDetector')} is missing; {_WAY_OUT}")
     factor = header.number("EstimatedRadiographicMagnificationFactor", frame)
-    sod = header.number("DistanceSourceToIsocenter", frame)
-    if not sod:
-        sod = header.number("DistanceSourceToPatient", frame)
+    sod = _own_sod(header, frame)
     if not sod and options.sod_mm is None:
         hint = f" (its magnification factor suggests {sdd / factor:.0f})" if factor else ""
         raise GeometryError(
@@ -167,6 +174,11 @@ def _distances(
             f"SDD / SOD = {sdd / sod:.3f}: is one of the distances to something else?"
         )
     return sod, sdd
+
+
+def _own_sod(header: Header, frame: int) -> float | None:
+    sod = header.number("DistanceSourceToIsocenter", frame)
+    return sod or header.number("DistanceSourceToPatient", frame)
 
 
 def _spacing(

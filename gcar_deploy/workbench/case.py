@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import PictureLimits, RunOptions
-from gcar_deploy.dicom.header import is_dicom
+from gcar_deploy.dicom.carm import unsaid
+from gcar_deploy.dicom.header import is_dicom, read_header
+from gcar_deploy.dicom.scene import read_run
 from gcar_deploy.errors import GcarError, GeometryError, UsageError
 from gcar_deploy.files import read_text
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
@@ -31,7 +33,7 @@ from gcar_deploy.inputs.order import MAX_BYTES, Order, order_to_json, parse_orde
 from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.result import Result
 from gcar_deploy.steps import Step
-from gcar_deploy.types import Array
+from gcar_deploy.types import Array, Image
 
 ORDER_NAME = "order.json"
 RESULT_NAME = "result"
@@ -40,7 +42,7 @@ REFUSED_NAME = "refused.txt"
 #: what the page may change of an order
 CORRECTIONS = (
     "edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry",
-    "pose", "segmenter", "predictor", "refiner",
+    "pixel_spacing_mm", "sod_mm", "pose", "segmenter", "predictor", "refiner",
 )  # fmt: skip
 
 
@@ -51,6 +53,7 @@ class Case:
     ----------
     folder : existing folder of the case, for ``order.json`` and ``result``
     order : Order; files in the folder by their names, others by full paths
+    names : what the user calls the views, for the page alone; empty for the names of their files
 
     Attributes
     ----------
@@ -66,9 +69,11 @@ class Case:
     revision : how often the order was kept
     """
 
-    def __init__(self, folder: Path, order: Order) -> None:
+    def __init__(self, folder: Path, order: Order, names: Sequence[str] = ()) -> None:
         self.folder, self.id = folder, folder.name
         self.key = secrets.token_urlsafe(16)
+        # Not in the order: a result must not carry the name of a file, which may be the patient's.
+        self.names = tuple(names) or tuple(path.name for path in order.views)
         self.result: Result | None = None
         self.job_id: str | None = None
         self.vessels: tuple[VesselImage, ...] = ()
@@ -169,8 +174,8 @@ class Case:
         out: dict[str, Any] = {
             "id": self.id, "key": self.key, "revision": self.revision,
             "order": self.order.to_dict(),
-            "order_file": str(self.order_file), "names": [p.name for p in self.order.views],
-            "views": [], "notes": [], "geometry": None, "problem": None, "sizes": None,
+            "order_file": str(self.order_file), "names": self.names,
+            "views": [], "notes": [], "geometry": None, "problem": None, "sizes": None, "lacks": {},
             "job": self.job_id, "result": self.result is not None,
             "dicom": [is_dicom(path) or is_cine(path) for path in self.ready_order.views],
         }  # fmt: skip
@@ -179,7 +184,8 @@ class Case:
             out["geometry"] = self._geometry(angiograms)
         except GcarError as error:
             out["problem"] = str(error)
-            out["sizes"] = self._sizes()
+            out["lacks"] = self._lacks()
+            out["sizes"] = None if out["lacks"] else self._sizes()
             # What is wrong can be put right only where it is shown.
             if isinstance(self.order.geometry, Mapping):
                 out["geometry"] = self.order.geometry
@@ -218,6 +224,27 @@ class Case:
             raise UsageError(f"view {number} is no run")
         return _frames(path)
 
+    def bare(self, number: int) -> Image:
+        """(rows, cols) counts of view ``number`` (from 1), also where its geometry is unknown.
+
+        Of a run it is the middle frame.
+
+        Raises
+        ------
+        GcarError
+            There is no such view, or it cannot be read.
+        """
+        views = self.ready_order.views
+        if not 1 <= number <= len(views):
+            raise UsageError(f"view {number}: there are {len(views)}")
+        path = views[number - 1]
+        run = _frames(path)
+        if run is not None:
+            return run.decode(len(run) // 2)
+        if is_dicom(path):
+            return read_run(path, RunOptions().dicom).pixels
+        return read_picture(path, PictureLimits())[0]
+
     def _prepared(self) -> tuple[tuple[Angiogram, ...], list[str]]:
         order = self.ready_order
         # Only what tells how the pictures are read: drawing must not read them again.
@@ -242,15 +269,26 @@ class Case:
 
     def _sizes(self) -> list[tuple[int, int]] | None:
         """(rows, columns) of pictures whose geometry nobody tells; None where it is told."""
-        if self.order.geometry is not None or any(
-            is_dicom(path) or is_cine(path) for path in self.ready_order.views
-        ):
+        if self.order.geometry is not None:
             return None
         try:
-            found = [read_picture(p, PictureLimits())[0] for p in self.ready_order.views]
+            found = [self.bare(k + 1) for k in range(len(self.order.views))]
         except GcarError:
             return None
         return [(picture.shape[0], picture.shape[1]) for picture in found]
+
+    def _lacks(self) -> dict[str, list[int]]:
+        """Key of the order -> numbers of the DICOM views (from 1) whose headers need it."""
+        out: dict[str, list[int]] = {}
+        views = self.ready_order.views
+        if self.order.geometry is not None or not all(map(is_dicom, views)):
+            return out
+        with contextlib.suppress(GcarError):
+            for number, path in enumerate(views, start=1):
+                for key in unsaid(read_header(path)):
+                    if getattr(self.order, key) is None:
+                        out.setdefault(key, []).append(number)
+        return out
 
     def _geometry(self, angiograms: tuple[Angiogram, ...]) -> Any:
         told = self.ready_order.geometry

@@ -6,7 +6,7 @@ import dataclasses
 import re
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,9 +66,9 @@ class Desk:
                 raise UsageError(f"{folder} cannot be made ({error.strerror})") from None
         return folder
 
-    def add(self, folder: Path, order: Order) -> Case:
-        """Put a case on the desk; ``folder`` is its own."""
-        case = Case(folder, order)
+    def add(self, folder: Path, order: Order, names: Sequence[str] = ()) -> Case:
+        """Put a case on the desk; ``folder`` is its own, ``names`` are its user's."""
+        case = Case(folder, order, names)
         self._cases[case.id] = case
         return case
 

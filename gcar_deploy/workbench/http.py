@@ -6,6 +6,7 @@ of its address, which browsers send to nobody. The page's policy lets it talk to
 
 from __future__ import annotations
 
+import re
 import threading
 from http import HTTPStatus
 from importlib import resources
@@ -45,6 +46,7 @@ _POLICY = (
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 _BODY_MIB = 512
 _THUMBNAIL_PX = 128
+_NAME_CHARACTERS = 80
 
 
 def create_app(desk: Desk, queue: JobQueue, token: str, first: str | None = None) -> Flask:
@@ -160,6 +162,10 @@ def _pictures(app: Flask, desk: Desk) -> None:
         angiograms = _case(desk, case_id).angiograms()
         return _png(picture_png(angiograms[_place(view, len(angiograms))].pixels))
 
+    @app.get("/api/cases/<case_id>/views/<int:view>/bare.png")
+    def bare(case_id: str, view: int) -> Any:
+        return _png(picture_png(_case(desk, case_id).bare(view)))
+
     @app.get("/api/cases/<case_id>/views/<int:view>/flat.png")
     def flat(case_id: str, view: int) -> Any:
         angiograms = _case(desk, case_id).judged()
@@ -260,6 +266,12 @@ def _png(data: bytes) -> Response:
     return Response(data, mimetype="image/png")
 
 
+def _called(name: str | None) -> str:
+    """Last part of a name that a browser gave, short and printable."""
+    last = re.split(r"[/\\]", name or "")[-1]
+    return "".join(c for c in last if c.isprintable())[:_NAME_CHARACTERS] or "picture"
+
+
 def _uploaded(desk: Desk) -> Case:
     """Make a case of the parts ``file``: pictures or runs by name, ``*.json`` is the geometry."""
     files = sorted(
@@ -278,9 +290,11 @@ def _uploaded(desk: Desk) -> Case:
         for name, file in zip([*names, *["geom.json"] * len(scenes)], [*views, *scenes],
                               strict=True):  # fmt: skip
             file.save(folder / name)
-        return desk.add(folder, parse_order(
-            {"views": names, **({"geometry": "geom.json"} if scenes else {})}
-        ))  # fmt: skip
+        return desk.add(
+            folder,
+            parse_order({"views": names, **({"geometry": "geom.json"} if scenes else {})}),
+            [_called(file.filename) for file in views],
+        )
     except GcarError:
         for path in folder.iterdir():
             path.unlink()

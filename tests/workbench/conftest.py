@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import socket
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ from gcar_deploy.worker.jobs import JobQueue
 from tests.conftest import PATIENCE_MS
 
 TOKEN = "a-token-of-the-tests"
+AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 
 
 @pytest.fixture(scope="session")
@@ -86,3 +89,50 @@ def finished(page) -> str:
     page.locator("#cancel").wait_for(state="hidden")
     page.locator("#status").wait_for()
     return page.inner_text("#status b >> nth=0").lower()
+
+
+def order_of(folder: Path) -> dict:
+    return json.loads((folder / "order.json").read_text())
+
+
+def on_screen(page, view: int, place):
+    """CSS place of a pixel of a view's picture, which is shown whole and square."""
+    canvas = page.locator(".view canvas").nth(view - 1)
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    unit = box["width"] / 512
+    return box["x"] + (place[0] + 0.5) * unit, box["y"] + (place[1] + 0.5) * unit
+
+
+def click(page, view, place):
+    page.mouse.click(*on_screen(page, view, place))
+
+
+def stroke(page, view, places):
+    page.mouse.move(*on_screen(page, view, places[0]))
+    page.mouse.down()
+    for place in places[1:]:
+        page.mouse.move(*on_screen(page, view, place), steps=3)
+    page.mouse.up()
+
+
+def nothing_serious(page):
+    """Let axe-core look at the page as it is."""
+    # The page's policy holds for scripts that it loads; the browser's own door is another.
+    page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
+    found = page.evaluate("axe.run()")
+    bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
+    told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in bad]
+    assert found["passes"] and not told, told
+
+
+def until(page, holds):
+    """Wait; the page's policy forbids Playwright's own way, which evaluates text."""
+    end = time.monotonic() + 240
+    while not holds():
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
+
+
+def until_order(page, case, has):
+    until(page, lambda: has(order_of(case)))

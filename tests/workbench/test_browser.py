@@ -17,15 +17,18 @@ from gcar_deploy.geometry.scene import parse_scene
 from gcar_deploy.inputs.order import Order, load_order, parse_order
 from gcar_deploy.tree.curves import resample
 from tests.conftest import of_data, ready_case
-from tests.workbench.conftest import finished
+from tests.workbench.conftest import (
+    click,
+    finished,
+    nothing_serious,
+    order_of,
+    stroke,
+    until,
+    until_order,
+)
 
-AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 #: what a run writes that holds no clock
 TIMELESS = ("volume.nii.gz", "centerline.csv", "centerline.vtp", "surface.stl", "gaussians.npz")
-
-
-def order_of(folder: Path) -> dict:
-    return json.loads((folder / "order.json").read_text())
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -37,49 +40,6 @@ def repeated(engine, case: Path, out: Path) -> dict[str, bytes]:
     order = dataclasses.replace(load_order(case / "order.json"), out=out)
     deliver(engine.reconstruct_order(order), order)
     return files_of(out)
-
-
-def on_screen(page, view: int, place):
-    """CSS place of a pixel of a view's picture, which is shown whole and square."""
-    canvas = page.locator(".view canvas").nth(view - 1)
-    canvas.scroll_into_view_if_needed()
-    box = canvas.bounding_box()
-    unit = box["width"] / 512
-    return box["x"] + (place[0] + 0.5) * unit, box["y"] + (place[1] + 0.5) * unit
-
-
-def click(page, view, place):
-    page.mouse.click(*on_screen(page, view, place))
-
-
-def stroke(page, view, places):
-    page.mouse.move(*on_screen(page, view, places[0]))
-    page.mouse.down()
-    for place in places[1:]:
-        page.mouse.move(*on_screen(page, view, place), steps=3)
-    page.mouse.up()
-
-
-def nothing_serious(page):
-    """Let axe-core look at the page as it is."""
-    # The page's policy holds for scripts that it loads; the browser's own door is another.
-    page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
-    found = page.evaluate("axe.run()")
-    bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
-    told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in bad]
-    assert found["passes"] and not told, told
-
-
-def until(page, holds):
-    """Wait; the page's policy forbids Playwright's own way, which evaluates text."""
-    end = time.monotonic() + 240
-    while not holds():
-        assert time.monotonic() < end
-        page.wait_for_timeout(50)
-
-
-def until_order(page, case, has):
-    until(page, lambda: has(order_of(case)))
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from gcar_deploy.workbench import http
 from gcar_deploy.workbench.desk import Desk
 from gcar_deploy.worker.jobs import JobQueue
 from tests.cli.conftest import good_case  # noqa: F401 - a fixture
-from tests.conftest import ready_case
+from tests.conftest import of_data, ready_case
 from tests.workbench.conftest import TOKEN
 
 pytest.importorskip("flask")
@@ -346,3 +346,25 @@ def test_frames_of_two_runs_come_with_how_they_go_together(ask, desk, tmp_path):
     # A frame chosen by hand keeps the scores.
     assert ask("PUT", f"/api/cases/{case.id}/order", json={"frames": [3, 4]}).status_code == 200
     assert ask("GET", f"/api/cases/{case.id}/views/1/frames").json["pairs"]["2"] == scores
+
+
+def test_what_headers_do_not_say_is_asked_for(ask, desk):
+    """A run without pixel spacing: named by the key that tells it, shown, and then read."""
+    pytest.importorskip("gdcm", reason="the runs are JPEG lossless")
+    from werkzeug.datastructures import MultiDict
+
+    folder = of_data("phantom_xa")
+    given = {"IM8.dcm": "runs/LAO.dcm", "IM1.dcm": "\u202eRAO.dcm"}
+    files = [("file", (io.BytesIO((folder / k).read_bytes()), name)) for k, name in given.items()]
+    case = ask("POST", "/api/cases", data=MultiDict(files)).json
+    assert case["names"] == ["LAO.dcm", "RAO.dcm"] and case["sizes"] is None
+    assert case["lacks"] == {"pixel_spacing_mm": [2]} and case["views"] == []
+    path = f"/api/cases/{case['id']}"
+    shown = ask("GET", f"{path}/views/2/bare.png")
+    assert shown.status_code == 200 and shown.data.startswith(b"\x89PNG")
+    assert ask("GET", f"{path}/views/3/bare.png").status_code == 400
+    told = ask("PUT", f"{path}/order", json={"pixel_spacing_mm": 0.39}).json
+    assert told["problem"] is None and told["lacks"] == {} and len(told["views"]) == 2
+    assert "RAO" not in desk.case(case["id"]).order_file.read_text()
+    again = ask("PUT", f"{path}/order", json={"pixel_spacing_mm": None}).json
+    assert again["lacks"] == case["lacks"]

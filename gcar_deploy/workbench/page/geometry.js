@@ -1,15 +1,16 @@
 // Where each view was taken from: a drawing of the C-arm, and its numbers to be edited.
+import * as api from "./api.js";
 import { $, direction, el } from "./dom.js";
 
 /** What the counts of a picture can be. */
 const KINDS = [["raw", "an X-ray picture as it was taken"], ["mask", "a mask: vessel or not"], ["path_length", "lengths of the path through vessel"]];
 const FIELDS = [
-  ["primary_angle_deg", "RAO \u2212 / LAO +", "\u00b0", -180, 180],
-  ["secondary_angle_deg", "Caudal \u2212 / cranial +", "\u00b0", -90, 90],
+  ["primary_angle_deg", "RAO \u2212 / LAO +", "\u00b0", -180, 180, "\u221230"],
+  ["secondary_angle_deg", "Caudal \u2212 / cranial +", "\u00b0", -90, 90, "25"],
   ["detector_rotation_deg", "Detector turned", "\u00b0", -360, 360],
-  ["sod_mm", "Source to isocentre", "mm", 300, 5000],
-  ["sdd_mm", "Source to detector", "mm", 300, 8000],
-  ["pixel_spacing_mm", "Pixel at the detector", "mm", 0.02, 10],
+  ["sod_mm", "Source to isocentre", "mm", 300, 5000, "750"],
+  ["sdd_mm", "Source to detector", "mm", 300, 8000, "1100"],
+  ["pixel_spacing_mm", "Pixel at the detector", "mm", 0.02, 10, "0.2"],
 ];
 
 /** Show one card a view; what is edited becomes part of the order. */
@@ -17,8 +18,9 @@ export function geometry(store, say) {
   const [cards, order] = [".cards", ".order"].map(name => $("geometry").querySelector(name));
   const told = store.info.geometry;
   order.replaceChildren();
+  if (Object.keys(store.info.lacks).length) { cards.replaceChildren(lacking(store, say)); return; }
   if (!told && store.info.sizes) { cards.replaceChildren(asked(store, say)); return; }
-  if (!told) { cards.replaceChildren(el("p", {}, store.info.problem ?? "Not known.")); return; }
+  if (!told) { cards.replaceChildren(el("p", {}, store.words(store.info.problem) ?? "Not known.")); return; }
   // A header's geometry belongs to its picture.
   const mixed = store.info.order.geometry && told.views.length > 1;
   cards.replaceChildren(...told.views.map((view, k) => card(store, say, view, k)));
@@ -40,33 +42,65 @@ function exchange(store, say, k) {
   return el("button", { type: "button", onclick }, `Exchange the geometry of views ${k + 1} and ${k + 2}`);
 }
 
+/** What is wrong with the geometry, and what the page asks for. */
+export function problem(store) {
+  const { info } = store, lacks = Object.entries(info.lacks);
+  if (lacks.length) return `${lacks.map(([key, views]) => `The header of ${views.map(k => info.names[k - 1]).join(" and ")} does not say ${LACKS[key]}.`).join(" ")} Say it below.`;
+  if (!info.sizes) return info.problem;
+  if (info.dicom.every(is => is)) return `${info.problem}; or say below where each was taken from.`;
+  return "These pictures came without their geometry. Say below where each was taken from, or drop them again together with their geom.json.";
+}
+const LACKS = { pixel_spacing_mm: "how large a pixel is at the detector", sod_mm: "how far the source is from the isocentre" };
+const field = key => FIELDS.find(([own]) => own === key);
+
+/** The picture as it is: what stands in it may tell where it was taken from. */
+function bare(store, say, k) {
+  const picture = el("img", { alt: `Picture of view ${k + 1}` }), link = el("a", { target: "_blank", title: "Full size" }, picture);
+  api.imageUrl(`${store.path}/views/${k + 1}/bare.png`).then(url => { picture.src = link.href = url; }).catch(error => say(error.message));
+  return link;
+}
+const blank = ([key, , , least, most, example], id) =>
+  el("input", { type: "number", id, name: key, min: least, max: most, step: "any", required: true, placeholder: `e.g. ${example}` });
+const asks = inputs => el("div", { class: "numbers" }, ...inputs.flatMap(([name, unit, input]) => [el("label", { for: input.id }, name), input, el("span", {}, unit)]));
+/** A form whose values become part of the order; then it is run. */
+const form = (store, say, values, ...rest) => el("form", { class: "cards asked", onsubmit: async e => {
+  e.preventDefault();
+  try {
+    await store.change(values());
+    if (!store.info.problem) { say(""); await store.run(); }
+  } catch (error) { say(error.message); }
+} }, ...rest);
+const titled = (store, k, size = "") => el("h3", {}, `View ${k + 1}: ${store.info.names[k]}${size}`);
+
+/** A form for what headers of runs do not say: one value holds for all runs. */
+function lacking(store, say) {
+  const inputs = Object.keys(store.info.lacks).map(key => { const [, name, unit] = field(key); return [name, unit, blank(field(key), `lack-${key}`)]; });
+  return form(store, say, () => Object.fromEntries(inputs.map(([, , input]) => [input.name, Number(input.value)])),
+    ...store.info.names.map((_, k) => el("div", { class: "carm bare" }, titled(store, k), bare(store, say, k))),
+    el("div", {}, asks(inputs), el("p", { class: "hint" }, "It holds for all runs that do not say it themselves."), el("button", { class: "main" }, "Use this")));
+}
+
 /** A form for pictures that came without their geometry: nothing is guessed, all is asked. */
 function asked(store, say) {
   const views = store.info.sizes.map(([rows, columns], k) => {
-    const inputs = FIELDS.filter(([key]) => key !== "detector_rotation_deg").map(([key, name, unit, least, most]) => [name, unit,
-      el("input", { type: "number", id: `new-${key}-${k}`, name: key, min: least, max: most, step: "any", required: true })]);
-    return { rows, columns, inputs, node: el("div", { class: "carm" }, el("h3", {}, `View ${k + 1}: ${store.info.names[k]}, ${columns} x ${rows}`),
-      el("div", { class: "numbers" }, ...inputs.flatMap(([name, unit, input]) => [el("label", { for: input.id }, name), input, el("span", {}, unit)]))) };
+    const inputs = FIELDS.filter(([key]) => key !== "detector_rotation_deg").map(one => [one[1], one[2], blank(one, `new-${one[0]}-${k}`)]);
+    return { rows, columns, inputs, node: el("div", { class: "carm bare" }, titled(store, k, `, ${columns} x ${rows}`), bare(store, say, k), asks(inputs)) };
   });
   const scale = el("input", { type: "number", id: "new-scale", min: 1e-9, max: 1000, step: "any" });
   const per = el("span", { hidden: true }, el("label", { for: scale.id }, " mm per count "), scale);
   const kind = el("select", { id: "new-kind", onchange: () => {
     per.hidden = kind.value !== "path_length"; scale.required = !per.hidden;
   } }, ...KINDS.map(([value, text]) => el("option", { value }, text)));
-  const use = async e => {
-    e.preventDefault();
+  const whole = () => {
     const intensity = kind.value === "path_length" ? { kind: kind.value, mm_per_count: Number(scale.value) } : { kind: kind.value };
     const read = ({ rows, columns, inputs }, k) => {
       const told = Object.fromEntries(inputs.map(([, , input]) => [input.name, Number(input.value)]));
       return { id: String(k + 1), ...told, rows, columns, intensity, pixel_spacing_mm: [told.pixel_spacing_mm, told.pixel_spacing_mm] };
     };
-    try {
-      await store.change({ geometry: { schema: "gcar-geometry/1", frame: "LPS", views: views.map(read) } });
-      if (!store.info.problem) { say(""); await store.run(); }
-    } catch (error) { say(error.message); }
+    return { geometry: { schema: "gcar-geometry/1", frame: "LPS", views: views.map(read) } };
   };
-  return el("form", { class: "cards", onsubmit: use }, ...views.map(view => view.node),
-    el("p", {}, el("label", { for: kind.id }, "The pictures are "), kind, per), el("p", {}, el("button", { class: "main" }, "Use this geometry")));
+  return form(store, say, whole, ...views.map(view => view.node),
+    el("div", {}, el("p", {}, el("label", { for: kind.id }, "The pictures are "), kind, per), el("button", { class: "main" }, "Use this geometry")));
 }
 
 function card(store, say, view, k) {
@@ -76,7 +110,7 @@ function card(store, say, view, k) {
       onchange: e => edit(store, say, k, key, e.target) });
     return [el("label", { for: `${key}-${k}` }, name), input, el("span", {}, unit)];
   });
-  return el("div", { class: "carm" }, el("h3", {}, `View ${view.id ?? k + 1}: ${direction(view.primary_angle_deg, view.secondary_angle_deg)}`),
+  return el("div", { class: "carm" }, el("h3", {}, `View ${view.id ?? k + 1}: ${direction(view.primary_angle_deg, view.secondary_angle_deg)} (${store.info.names[k]})`),
     drawing(view), el("div", { class: "numbers" }, ...numbers));
 }
 

@@ -2,7 +2,7 @@
 import * as api from "./api.js";
 import { $, el } from "./dom.js";
 import { frames } from "./frames.js";
-import { geometry } from "./geometry.js";
+import { geometry, problem } from "./geometry.js";
 import { Curve, table } from "./lumen.js";
 import { Picture } from "./picture.js";
 import { alternatives, corrections, files, status } from "./report.js";
@@ -16,12 +16,9 @@ const tools = new Toolbox(store, say);
 const curve = new Curve(store);
 let pictures = [], scene = new Scene3D(store);
 
-const UNTOLD = "These pictures came without their geometry. Say below where each was taken from, or drop them again together with their geom.json.";
-
-function say(text, good = false) {
+function say(text) {
   $("message").hidden = !text;
-  $("message").className = good ? "message good" : "message";
-  $("message").textContent = text ?? "";
+  $("message").textContent = store.words(text ?? "");
 }
 /** Do something that may fail; its error becomes a sentence. */
 async function attempt(act) {
@@ -47,9 +44,20 @@ async function open(info, run = true) {
   $("case-name").textContent = info.id; document.title = `${info.id} \u2013 gcar`;
   scene = new Scene3D(store);
   store.open(info);
-  if (info.problem) { say(info.sizes ? UNTOLD : info.problem); $("geometry").open = true; }
+  if (info.problem) ask();
   else if (run) await store.run();
 }
+/** Say what the page must know before there can be a run, and show where it is asked for. */
+function ask() {
+  say(problem(store));
+  $("geometry").open = true;
+}
+const run = () => attempt(async () => {
+  if (!store.info.problem) return store.run();
+  ask();
+  $("geometry").scrollIntoView();
+  $("geometry").querySelector("input")?.focus({ preventScroll: true });
+});
 async function send(list) {
   const body = new FormData();
   for (const file of list) body.append("file", file);
@@ -114,7 +122,7 @@ store.addEventListener("opened", () => { lay(); buttons(); status(store); correc
 store.addEventListener("pictures", lay);
 store.addEventListener("changed", () => {
   buttons(); corrections(store, say); draw();
-  if (store.info.problem) say(store.info.problem);
+  if (store.info.problem) ask();
 });
 store.addEventListener("progress", () => {
   buttons();
@@ -137,7 +145,7 @@ store.addEventListener("chosen", () => { mark(); curve.follow(); pictures.forEac
 $("demo").addEventListener("click", () => attempt(async () => open(await api.post("/api/demo"))));
 $("files").addEventListener("change", e => attempt(() => send(e.target.files)));
 $("home").addEventListener("click", () => attempt(async () => home(await api.get("/api/desk"))));
-$("run").addEventListener("click", () => attempt(() => store.run()));
+$("run").addEventListener("click", run);
 $("cancel").addEventListener("click", () => attempt(() => store.cancel()));
 $("undo").addEventListener("click", () => attempt(() => store.undo()));
 $("redo").addEventListener("click", () => attempt(() => store.redo()));
@@ -160,7 +168,7 @@ window.addEventListener("keydown", e => {
   if (e.ctrlKey || e.metaKey || e.altKey) return;
   const tool = TOOLS.find(([, , letter]) => letter.toLowerCase() === key);
   if (tool) tools.take(tool[0]);
-  else if (key === "r") attempt(() => store.run());
+  else if (key === "r") run();
   else if (key === "escape") tools.take("look");
   else if (key === "enter" && tools.corners) tools.finish(null);
   else if (key === "h") { $("show-tree").click(); }

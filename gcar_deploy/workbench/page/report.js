@@ -7,7 +7,7 @@ export function status(store) {
   if (box.hidden) return;
   const word = result ? result.summary.status : job.state;
   box.className = `status ${word}`;
-  if (!result) { box.replaceChildren(el("b", {}, word), job.error?.message ?? ""); return; }
+  if (!result) { box.replaceChildren(el("b", {}, word), store.words(job.error?.message ?? "")); return; }
   const { summary } = result, said = [...(summary.findings.length > 1 ? summary.findings : []), ...summary.notes];
   const facts = [["views apart", `${summary.separation_deg.toFixed(0)}\u00b0`], ["branches", summary.tree.branches.length],
     ["centreline", `${summary.tree.length_mm.toFixed(0)} mm`], ["time", `${summary.seconds.total.toFixed(1)} s`]];
@@ -46,6 +46,8 @@ export function corrections(store, say) {
   (now.ostia ?? []).forEach((_, k) => add(`Ostium O${k + 1}`, { ostia: without(now.ostia, k) }));
   (now.deleted_mm ?? []).forEach((place, k) => add(`Branch deleted at (${place.map(x => x.toFixed(0)).join(", ")}) mm`, { deleted_mm: without(now.deleted_mm, k) }));
   if (now.geometry && store.told !== undefined && JSON.stringify(now.geometry) !== JSON.stringify(store.told)) add("Geometry", { geometry: store.told });
+  if (now.pixel_spacing_mm) add(`Pixel at the detector ${now.pixel_spacing_mm} mm`, { pixel_spacing_mm: null });
+  if (now.sod_mm) add(`Source to isocentre ${now.sod_mm} mm`, { sod_mm: null });
   $("corrections").hidden = !lines.length;
   $("corrections").querySelector("ul").replaceChildren(...lines);
 }

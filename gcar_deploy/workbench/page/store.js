@@ -2,7 +2,9 @@
 import * as api from "./api.js";
 
 // What is undone and redone: keys of the order that the page changes.
-const KEYS = ["edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry"];
+const KEYS = ["edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "frames", "geometry", "pixel_spacing_mm", "sod_mm"];
+/** Of these, what the pictures are read by. */
+const READING = ["frames", "geometry", "pixel_spacing_mm", "sod_mm"];
 const corrections = order => Object.fromEntries(KEYS.map(key => [key, order[key] ?? null]));
 /** A branch of a new result is an earlier one where their middles lie so near, mm. */
 const SAME_MM = 5;
@@ -19,6 +21,12 @@ export class Store extends EventTarget {
   /** Whether the result was made without the corrections of now. */
   get stale() { return this.ran !== null && !same(this.ran, this.now); }
 
+  /** A sentence with the names that the user's files had. */
+  words(text) {
+    const stored = this.info?.order.views.map(path => path.split(/[\\/]/).at(-1)) ?? [];
+    const any = stored.map(name => name.replace(/[^\w]/g, "\\$&")).join("|");
+    return text && any ? text.replace(new RegExp(any, "g"), name => this.info.names[stored.indexOf(name)]) : text;
+  }
   tell(what) { this.dispatchEvent(new Event(what)); }
 
   open(info) {
@@ -70,7 +78,7 @@ export class Store extends EventTarget {
       await this.#refresh();
       throw error;
     }
-    if ("geometry" in changed || "frames" in changed) this.tell("pictures");
+    if (READING.some(key => key in changed)) this.tell("pictures");
   }
   /** Show the case as the server has it; what was undone before belongs to another one. */
   async #refresh() {
