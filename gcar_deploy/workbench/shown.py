@@ -32,7 +32,8 @@ def result_data(result: Result) -> dict[str, Any]:
     start = inlet_arcs(result.tree)
     scene = scene_data(result)
     for branch, row in zip(scene["branches"], summary["tree"]["branches"], strict=True):
-        branch["from_ostium"] = round(start[branch["branch"] - 1], 2)
+        far = start[branch["branch"] - 1]
+        branch["from_ostium"] = None if far is None else round(far, 2)
         branch["middle"] = middle(result.tree, branch["branch"] - 1)
         branch["row"] = row
     return {
@@ -48,14 +49,19 @@ def middle(tree: Tree, branch: int) -> list[float]:
     return [round(float(x), 2) for x in one.points_mm[at]]
 
 
-def inlet_arcs(tree: Tree) -> list[float]:
-    """Distance of each branch's inlet from its ostium, mm; parents have lower numbers."""
-    far: dict[int, float] = {}
+def inlet_arcs(tree: Tree) -> list[float | None]:
+    """Distance of each branch's inlet from the ostium, mm; parents have lower numbers.
+
+    The ostium is the first branch's. None for parts that do not hang on it: how far they are from
+    it, nobody knows.
+    """
+    far: dict[int, float] = {tree.branches[0].start: 0.0} if tree.branches else {}
     out = []
     for branch in tree.branches:
-        start = far.setdefault(branch.start, 0.0)
+        start = far.get(branch.start)
         out.append(start)
-        far.setdefault(branch.end, start + branch.length_mm)
+        if start is not None:
+            far.setdefault(branch.end, start + branch.length_mm)
     return out
 
 

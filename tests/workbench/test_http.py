@@ -224,6 +224,23 @@ def test_crossings_are_the_vessels_on_the_line():
     assert sorted(found) == [[10.0, 20.0], [30.0, 20.0]]
 
 
+def test_only_what_hangs_on_the_ostium_is_so_far_from_it():
+    import numpy as np
+
+    from gcar_deploy.tree.tree import Branch, Tree
+    from gcar_deploy.workbench.shown import inlet_arcs
+
+    nodes = np.array([[x, 0.0, 0.0] for x in (0, 10, 30, 33, 50)])
+    ends = ((0, 1), (1, 2), (3, 4))
+    branches = tuple(
+        Branch(points_mm=nodes[list(pair)], radius_mm=np.ones(2), sigma_mm=np.ones(2),
+               confidence=np.ones(2), start=pair[0], end=pair[1])
+        for pair in ends
+    )  # fmt: skip
+    assert inlet_arcs(Tree(nodes_mm=nodes, branches=branches)) == [0.0, 10.0, None]
+    assert inlet_arcs(Tree(nodes_mm=nodes, branches=())) == []
+
+
 def test_a_trace_follows_the_line_not_the_chord():
     import numpy as np
 

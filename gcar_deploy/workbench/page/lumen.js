@@ -19,7 +19,7 @@ export function table(store, erase) {
     const { row } = branch, percent = row.stenosis_percent;
     const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
       fixed(row.minimal_diameter_mm, 2), reference(row), fixed(row.lesion_length_mm, 1),
-      row.minimal_at_mm === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
+      row.minimal_at_mm === null || branch.from_ostium === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
       row.ghost_probability === null ? "\u2013" : `${Math.round(100 * row.ghost_probability)}`];
     const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
       // Rounded down: what is not certain never reads 100 %.
@@ -40,6 +40,8 @@ export function jumpTo(store, branch) {
   store.choose(branch.branch);
   if (branch.least) store.point({ branch: branch.branch, at: nearest(branch.arc, branch.least[0]) });
 }
+/** From where distances count: a part that does not hang on the ostium's has its own beginning. */
+const from = branch => branch.from_ostium === null ? "along the vessel, which does not hang on the ostium" : "from the ostium";
 const nearest = (list, value) => list.reduce((best, x, i) => Math.abs(x - value) < Math.abs(list[best] - value) ? i : best, 0);
 
 export class Curve {
@@ -83,13 +85,18 @@ export class Curve {
   draw() {
     const [ctx, width, height] = pen(this.canvas), way = this.store.result?.ways[this.way];
     if (!way) { this.parts = null; return; }
-    const parts = this.parts = way.map(number => { const branch = this.store.branch(number); return { branch, start: branch.from_ostium }; });
+    let along = 0;
+    const parts = this.parts = way.map(number => {
+      const branch = this.store.branch(number), part = { branch, start: branch.from_ostium ?? along };
+      along = part.start + branch.arc.at(-1);
+      return part;
+    });
     const last = parts.at(-1), length = last.start + last.branch.arc.at(-1);
     const widest = Math.max(...parts.flatMap(p => [...p.branch.radius, ...p.branch.reference.map(r => r ?? 0)]));
     const most = Math.max(1, Math.ceil(2 * widest)), left = 34, right = width - 8, top = 18, bottom = height - 32;
     const x = s => left + (right - left) * s / length, y = w => bottom - (bottom - top) * w / most;
     this.frame = { s: px => (px - left) / (right - left) * length };
-    this.axes(ctx, { left, right, top, bottom, most, length, x, y });
+    this.axes(ctx, { from: from(parts[0].branch), left, right, top, bottom, most, length, x, y });
     for (const { branch, start } of parts) {
       if (branch.lesion) {
         const [begin, end] = branch.lesion.map(s => x(start + s));
@@ -115,7 +122,7 @@ export class Curve {
     }
     $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: least diameter; shaded: lesion.";
   }
-  axes(ctx, { left, right, top, bottom, most, length, x, y }) {
+  axes(ctx, { from, left, right, top, bottom, most, length, x, y }) {
     ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = "#525c6b"; ctx.strokeStyle = "#e3e8ee"; ctx.lineWidth = 1;
     ctx.textAlign = "right"; ctx.textBaseline = "middle";
     for (let w = 0; w <= most; w += most > 5 ? 2 : 1) {
@@ -124,12 +131,12 @@ export class Curve {
     ctx.textAlign = "center"; ctx.textBaseline = "top";
     const stride = [5, 10, 20, 50, 100].find(t => length / t <= 8) || 200;
     for (let s = 0; s <= length; s += stride) ctx.fillText(String(s), x(s), bottom + 4);
-    ctx.textAlign = "right"; ctx.fillText("mm from the ostium", right, bottom + 18);
+    ctx.textAlign = "right"; ctx.fillText(`mm ${from}`, right, bottom + 18);
     ctx.textAlign = "left"; ctx.fillText("diameter, mm", 4, bottom + 18); ctx.textBaseline = "alphabetic";
   }
   said({ branch, start }, i) {
     const reference = branch.reference[i], sigma = branch.sigma[i];
-    return `Branch ${nameOf(branch)}, ${(start + branch.arc[i]).toFixed(1)} mm from the ostium: ${(2 * branch.radius[i]).toFixed(2)} mm` +
+    return `Branch ${nameOf(branch)}, ${(start + branch.arc[i]).toFixed(1)} mm ${from(branch)}: ${(2 * branch.radius[i]).toFixed(2)} mm` +
       (reference === null ? "" : `, reference ${(2 * reference).toFixed(2)} mm (${Math.max(0, Math.round(100 * (1 - branch.radius[i] / reference)))} % narrower)`) +
       (sigma === null ? "." : `, \u00b1 ${sigma.toFixed(2)} mm.`);
   }
