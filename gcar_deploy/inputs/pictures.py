@@ -125,7 +125,10 @@ def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
 
 def _said(drawn: Drawn) -> list[str]:
     count = {do: sum(one.do == do for one in drawn.strokes) for do in ("erase", "paint")}
-    out = [f"{n} strokes of the user {do} vessel" for do, n in count.items() if n]
+    out = [
+        f"{n} strokes of the user {do} vessel" if n > 1 else f"1 stroke of the user {do}s vessel"
+        for do, n in count.items() if n
+    ]  # fmt: skip
     return out + (["only the user's region of interest is looked at"] if drawn.region else [])
 
 

@@ -155,7 +155,7 @@ def test_erased_vessel_is_not_found_and_is_said(engine, order, plain):
         strokes[k] = (Stroke(do="erase", points=points, width_px=14.0),)
     found = again(engine, order, edits=strokes)
     gap = np.linalg.norm(found.tree.points() - leaf.points_mm[-1], axis=1).min()
-    assert gap > 3 and "view 1: 1 strokes of the user erase vessel" in found.notes
+    assert gap > 3 and "view 1: 1 stroke of the user erases vessel" in found.notes
     for k, view in enumerate(found.views):
         assert view.path_mm.sum() < plain.views[k].path_mm.sum()
 

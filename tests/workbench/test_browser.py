@@ -85,7 +85,8 @@ def way_of_a_case(page, case, strokes, marks):
     stroke(page, 1, strokes)
     until_order(page, case, lambda o: len(o.get("edits", {}).get("1", ())) == 1)
     drawn = order_of(case)["edits"]["1"][0]
-    assert drawn["do"] == "erase" and drawn["width_px"] == 14
+    told = page.inner_text("#brush-out").split()
+    assert drawn["do"] == "erase" and drawn["width_px"] == int(told[0])
     assert np.allclose(drawn["points"][0], strokes[0], atol=1.5)
     page.keyboard.press("l")
     click(page, 1, marks[0])
@@ -99,7 +100,7 @@ def way_of_a_case(page, case, strokes, marks):
     page.click("#run")
     finished(page)
     page.click("#status summary >> nth=0")
-    assert "1 strokes of the user erase vessel" in page.inner_text("#status")
+    assert "1 stroke of the user erases vessel" in page.inner_text("#status")
     corrected, rows = files_of(case / "result"), page.locator("#lesions tbody tr")
     before = rows.count()
     page.locator("#lesions tbody button[aria-label^=Delete]").last.click()
