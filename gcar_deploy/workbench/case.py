@@ -62,6 +62,7 @@ class Case:
     order : Order
     result : of the last run that ended well, None before
     job_id : of the last run, None before
+    asked, made_by : order of the last run, and of that which made the result; None before
     vessels : found by the last run, refused or not, in the order of the views; empty before
     pair_scores : numbers of two views, from 1, the lower first -> (n, m) how well each frame of
         the one goes with each of the other, 0 .. 1; empty where nobody judged pairs
@@ -76,6 +77,8 @@ class Case:
         self.names = tuple(names) or tuple(path.name for path in order.views)
         self.result: Result | None = None
         self.job_id: str | None = None
+        self.asked: Order | None = None
+        self.made_by: Order | None = None
         self.vessels: tuple[VesselImage, ...] = ()
         self.pair_scores: dict[tuple[int, int], Array] = {}
         self.proposed: dict[int, ChosenFrame] = {}
@@ -176,7 +179,8 @@ class Case:
             "order": self.order.to_dict(),
             "order_file": str(self.order_file), "names": self.names,
             "views": [], "notes": [], "geometry": None, "problem": None, "sizes": None, "lacks": {},
-            "job": self.job_id, "result": self.result is not None,
+            "job": self.job_id, "since": self.asked != self.ready_order,
+            "result": self.result is not None, "stale": self.made_by != self.ready_order,
             "dicom": [is_dicom(path) or is_cine(path) for path in self.ready_order.views],
         }  # fmt: skip
         try:

@@ -123,7 +123,7 @@ class Desk:
             raise
         folder = deliver(result, order)
         case.say_refused(None)
-        case.result = result
+        case.result, case.made_by = result, order
         return result.summary(), folder
 
 

@@ -135,8 +135,9 @@ def _jobs(app: Flask, desk: Desk, queue: JobQueue) -> None:
         if before is not None and before.open:
             # What it would find is no longer asked for.
             queue.cancel(before)
-        job = queue.submit(Received(case.ready_order))
-        case.job_id = job.id
+        order = case.ready_order
+        job = queue.submit(Received(order))
+        case.job_id, case.asked = job.id, order
         return _told(job, queue), HTTPStatus.ACCEPTED
 
     @app.get("/api/jobs/<job_id>")

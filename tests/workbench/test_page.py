@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.conftest import of_data
-from tests.workbench.conftest import finished, nothing_serious, order_of, until
+from tests.workbench.conftest import finished, nothing_serious, order_of, stroke, until, until_order
 
 
 def test_runs_whose_headers_lack_the_pixel_are_asked_for_it(serve, browse):
@@ -51,3 +51,57 @@ def test_pictures_without_geometry_are_shown_beside_what_is_asked(serve, browse)
     assert "--geom" not in page.inner_text("main")
     assert page.evaluate("document.activeElement.id") == "new-primary_angle_deg-0"
     nothing_serious(page)
+
+
+@pytest.mark.slow
+def test_strokes_are_as_wide_as_a_vessel_and_hide_nothing(serve, browse):
+    """2 mm in the patient to begin with; what the last run found stays where it was drawn."""
+    address, cases = serve(lambda desk: desk.demo().id)
+    page = browse(address)
+    finished(page)
+    page.wait_for_timeout(500)
+    page.uncheck("#show-tree")
+    page.click("[data-tool=erase]")
+    width, unit, mm, _ = page.inner_text("#brush-out").split()
+    assert unit == "px," and 1.7 < float(mm) < 2.3
+    canvas = page.locator(".view canvas").first
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    lower = {**box, "y": box["y"] + box["height"] / 4, "height": box["height"] / 2}
+
+    def shown():
+        page.mouse.move(2, 2)
+        return page.screenshot(clip=lower)
+
+    before = shown()
+    stroke(page, 1, [(400, 20), (480, 20)])
+    until_order(page, cases / "demo", lambda order: "edits" in order)
+    assert order_of(cases / "demo")["edits"]["1"][0]["width_px"] == int(width)
+    assert shown() == before
+    page.uncheck("#show-found")
+    assert shown() != before
+
+
+@pytest.mark.slow
+def test_a_reload_opens_the_case_again_and_does_not_run_it(serve, browse):
+    """Its name stands in the address; what was deleted is told by the name that it had."""
+    address, _ = serve()
+    page = browse(address)
+    page.click("#demo")
+    assert finished(page) == "ok"
+    page.locator("#lesions tbody button[aria-label^=Delete]").first.click()
+    page.locator("#corrections li").wait_for()
+    finished(page)
+    assert page.inner_text("#corrections li").startswith("Deleted branch 4 LAD")
+    rows = page.locator("#lesions tbody tr")
+    before, runs = rows.count(), []
+    page.on("request", lambda request: request.url.endswith("/run") and runs.append(request.url))
+    assert page.url.endswith("/#case=demo")
+    page.reload()
+    finished(page)
+    assert rows.count() == before and page.inner_text("#case-name") == "demo"
+    page.click("#home")
+    page.click("#cases button")
+    finished(page)
+    assert rows.count() == before and runs == []
+    assert "stale" not in page.locator("#run").get_attribute("class")

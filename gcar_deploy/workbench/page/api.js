@@ -1,9 +1,14 @@
 // The way to the server: every call bears the token, which came behind the # of the address.
+// There stands afterwards which case is open, so that a reload opens it again.
 const KEY = "gcar-token";
-const given = location.hash.slice(1);
-if (given) {
-  sessionStorage.setItem(KEY, given);
-  history.replaceState(null, "", location.pathname);
+const given = location.hash.slice(1).split("&"), named = given.find(part => part.startsWith("case="));
+const given_token = given.find(part => part && !part.includes("="));
+/** Name of the case in the address, null where there is none. */
+export const asked = named ? decodeURIComponent(named.slice(5)) : null;
+export const address = id => history.replaceState(null, "", id ? `#case=${encodeURIComponent(id)}` : location.pathname);
+if (given_token) {
+  sessionStorage.setItem(KEY, given_token);
+  address(asked);
 }
 const token = sessionStorage.getItem(KEY) || "";
 

@@ -1,6 +1,6 @@
 // The page: start, the case, and what connects its parts.
 import * as api from "./api.js";
-import { $, el } from "./dom.js";
+import { $, el, nameOf } from "./dom.js";
 import { frames } from "./frames.js";
 import { geometry, problem } from "./geometry.js";
 import { Curve, table } from "./lumen.js";
@@ -29,23 +29,26 @@ async function attempt(act) {
 async function start() {
   const desk = await api.get("/api/desk");
   document.querySelectorAll(".use").forEach(p => { p.textContent = desk.use; });
-  if (desk.first) return open(await api.get(`/api/cases/${desk.first}`));
+  const id = desk.cases.includes(api.asked) ? api.asked : desk.first;
+  if (id) return open(await api.get(`/api/cases/${id}`));
   home(desk);
 }
 function home(desk) {
+  api.address(null);
   $("start").hidden = false; $("case").hidden = true; $("case-tools").hidden = true; $("case-name").textContent = "";
   $("earlier").hidden = !desk.cases.length;
   $("cases").replaceChildren(...desk.cases.map(id => el("li", {}, el("button", { type: "button",
     onclick: () => attempt(async () => open(await api.get(`/api/cases/${id}`))) }, id))));
 }
 
-async function open(info, run = true) {
+async function open(info) {
+  api.address(info.id);
   $("start").hidden = true; $("case").hidden = false; $("case-tools").hidden = false;
   $("case-name").textContent = info.id; document.title = `${info.id} \u2013 gcar`;
   scene = new Scene3D(store);
   store.open(info);
   if (info.problem) ask();
-  else if (run) await store.run();
+  else await store.resume();
 }
 /** Say what the page must know before there can be a run, and show where it is asked for. */
 function ask() {
@@ -84,9 +87,9 @@ async function loadFound() {
     picture.draw();
   }));
 }
-function lay() {
+function lay(anew = false) {
   pictures = store.info.views.map((_, k) => new Picture(store, k + 1, tools, look));
-  tools.pictures = pictures; tools.clear();
+  tools.pictures = pictures; tools.clear(); tools.fit(store.info.views, anew);
   scene.root.hidden = !pictures.length;
   $("pictures").replaceChildren(...pictures.map(p => p.root), scene.root);
   $("tools").hidden = !pictures.length;
@@ -113,13 +116,14 @@ const erase = branch => attempt(async () => {
   const gone = store.now.deleted_mm ?? [];
   // A second press while the first is under way names the same branch.
   if (gone.some(place => JSON.stringify(place) === JSON.stringify(branch.middle))) return;
+  store.gone.set(JSON.stringify(branch.middle), nameOf(branch));
   store.choose(0);
   await store.change({ deleted_mm: [...gone, branch.middle] });
   await store.run();
 });
 
-store.addEventListener("opened", () => { lay(); buttons(); status(store); corrections(store, say); $("lumen").hidden = true; $("files-of").hidden = true; $("alternatives").hidden = true; });
-store.addEventListener("pictures", lay);
+store.addEventListener("opened", () => { lay(true); buttons(); status(store); corrections(store, say); $("lumen").hidden = true; $("files-of").hidden = true; $("alternatives").hidden = true; });
+store.addEventListener("pictures", () => lay());
 store.addEventListener("changed", () => {
   buttons(); corrections(store, say); draw();
   if (store.info.problem) ask();

@@ -124,7 +124,7 @@ export class Picture {
       ctx.beginPath(); ctx.rect(0, 0, width, height);
       ctx.arc(...this.hover, LENS, 0, 2 * Math.PI, true); ctx.clip();
     }
-    if (this.look.found && !this.store.stale) { ctx.globalAlpha = this.store.result && this.look.tree ? 0.45 : 1; lay(this.found); ctx.globalAlpha = 1; }
+    if (this.look.found) { ctx.globalAlpha = this.store.result && this.look.tree ? 0.45 : 1; lay(this.found); ctx.globalAlpha = 1; }
     if (this.store.result && this.look.tree) this.tree(ctx);
     ctx.restore();
     this.tools.draw(this, ctx);

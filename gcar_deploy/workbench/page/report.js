@@ -3,7 +3,7 @@ import { $, el } from "./dom.js";
 
 export function status(store) {
   const box = $("status"), { job, result } = store;
-  box.hidden = !job || store.running;
+  box.hidden = !(job || result) || store.running;
   if (box.hidden) return;
   const word = result ? result.summary.status : job.state;
   box.className = `status ${word}`;
@@ -44,7 +44,7 @@ export function corrections(store, say) {
   (now.landmarks ?? []).forEach((_, k) => add(`Landmark L${k + 1}`, { landmarks: without(now.landmarks, k) }));
   (now.same_branch ?? []).forEach((_, k) => add(`Same branch B${k + 1}`, { same_branch: without(now.same_branch, k) }));
   (now.ostia ?? []).forEach((_, k) => add(`Ostium O${k + 1}`, { ostia: without(now.ostia, k) }));
-  (now.deleted_mm ?? []).forEach((place, k) => add(`Branch deleted at (${place.map(x => x.toFixed(0)).join(", ")}) mm`, { deleted_mm: without(now.deleted_mm, k) }));
+  (now.deleted_mm ?? []).forEach((place, k) => add(`Deleted branch ${store.gone.get(JSON.stringify(place)) ?? `at (${place.map(x => x.toFixed(0)).join(", ")}) mm`}`, { deleted_mm: without(now.deleted_mm, k) }));
   if (now.geometry && store.told !== undefined && JSON.stringify(now.geometry) !== JSON.stringify(store.told)) add("Geometry", { geometry: store.told });
   if (now.pixel_spacing_mm) add(`Pixel at the detector ${now.pixel_spacing_mm} mm`, { pixel_spacing_mm: null });
   if (now.sod_mm) add(`Source to isocentre ${now.sod_mm} mm`, { sod_mm: null });

@@ -11,6 +11,8 @@ const SAME_MM = 5;
 const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 export class Store extends EventTarget {
+  /** Place of a deleted branch -> the name that it had. */
+  gone = new Map();
   info = null; result = null; job = null; running = false;
   chosen = 0; cursor = null; spot = null; ran = null; #past = []; #future = []; #runs = 0; #last = Promise.resolve();
 
@@ -89,13 +91,28 @@ export class Store extends EventTarget {
     this.tell("pictures"); this.tell("changed");
   }
 
-  async run() {
+  /** Show what this session has made of the case, or follow the run that is under way; else run. */
+  async resume() {
+    const { info } = this, opened = this.#runs;
+    const job = info.job && await api.get(`/api/jobs/${info.job}`).catch(() => null);
+    const result = info.result ? await api.get(`${this.path}/result`) : null;
+    if (opened !== this.#runs) return;
+    if (result) {
+      Object.assign(this, { job, result, ran: info.stale ? {} : this.now, chosen: worst(result.scene.branches) });
+      this.tell("finished");
+    }
+    const under_way = ["queued", "running"].includes(job?.state);
+    if (under_way || !result) await this.run(under_way || ["refused", "failed"].includes(job?.state) ? job : null);
+  }
+
+  /** Run the case, or follow a run of it that was begun. */
+  async run(known = null) {
     if (this.running) await this.cancel();
-    const asked = this.now, path = this.path, own = ++this.#runs, chosen = this.branch(this.chosen);
+    const asked = known && this.info.since ? {} : this.now, path = this.path, own = ++this.#runs, chosen = this.branch(this.chosen);
     this.running = true;
     this.tell("progress");
     try {
-      const begun = this.job = await api.post(`${path}/run`);
+      const begun = this.job = known ?? await api.post(`${path}/run`);
       const done = await api.follow(begun, job => {
         if (own === this.#runs) { this.job = job; this.tell("progress"); }
       });

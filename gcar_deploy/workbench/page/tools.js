@@ -15,6 +15,8 @@ export const TOOLS = [
 const round = point => point.map(x => Math.round(x * 10) / 10);
 const KEYS = { landmark: "landmarks", same: "same_branch", ostium: "ostia" };
 const INK = { erase: "#ff7a33", paint: "#56b4e9" };
+/** Width of a coronary vessel, mm. */
+const USUAL_MM = 2;
 /** Points of one stroke of an order. */
 const MOST = 2000;
 /** A click this near to a crossing is put onto it, CSS pixels. */
@@ -22,12 +24,21 @@ const SNAP = 18;
 
 export class Toolbox {
   constructor(store, say) {
-    Object.assign(this, { store, say, name: "look", brush: 14, pictures: [] });
+    Object.assign(this, { store, say, name: "look", brush: 14, mm: 0, pictures: [] });
     this.clear();
     $("tool-buttons").replaceChildren(...TOOLS.map(([name, text, key, hint]) =>
       el("button", { type: "button", "aria-pressed": "false", "data-tool": name, title: `${hint} (${key})`, onclick: () => this.take(name) }, text)));
-    $("brush").addEventListener("input", () => { this.brush = Number($("brush").value); $("brush-out").textContent = `${this.brush} px`; });
+    $("brush").addEventListener("input", () => { this.wide(Number($("brush").value)); });
     this.take("look");
+  }
+  /** Strokes begin as wide as a vessel usually is, and are told by their width in the patient. */
+  fit(views, anew) {
+    this.mm = views.reduce((sum, view) => sum + view.pixel_mm, 0) / views.length || 0;
+    this.wide(anew && this.mm ? Math.max(3, Math.min(60, Math.round(USUAL_MM / this.mm))) : this.brush);
+  }
+  wide(brush) {
+    this.brush = $("brush").valueAsNumber = brush;
+    $("brush-out").textContent = `${brush} px, ${(brush * this.mm).toFixed(1)} mm`;
   }
   /** Whether dragging draws a stroke. */
   get draws() { return this.name === "erase" || this.name === "paint"; }
