@@ -99,10 +99,12 @@ def way_of_a_case(page, case, strokes, marks):
     assert np.linalg.norm(np.array(pair[1]) - marks[1]) < 24
     page.click("#run")
     finished(page)
-    page.click("#status summary >> nth=0")
+    page.click("#status .notes summary")
     assert "1 stroke of the user erases vessel" in page.inner_text("#status")
     corrected, rows = files_of(case / "result"), page.locator("#lesions tbody tr")
     before = rows.count()
+    if page.locator("#more").is_visible():
+        page.click("#more")
     page.locator("#lesions tbody button[aria-label^=Delete]").last.click()
     until(page, lambda: rows.count() < before)
     finished(page)

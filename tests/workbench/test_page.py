@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
+from gcar_deploy.inputs.order import Order
 from tests.conftest import of_data
 from tests.workbench.conftest import finished, nothing_serious, order_of, stroke, until, until_order
 
@@ -105,3 +108,39 @@ def test_a_reload_opens_the_case_again_and_does_not_run_it(serve, browse):
     finished(page)
     assert rows.count() == before and runs == []
     assert "stale" not in page.locator("#run").get_attribute("class")
+
+
+def boxes(page, *names):
+    """(left, top, right, bottom) of elements that are seen."""
+    found = [page.locator(name).nth(k) for name in names for k in range(page.locator(name).count())]
+    seen = [one.bounding_box() for one in found if one.is_visible()]
+    return [(b["x"], b["y"], b["x"] + b["width"], b["y"] + b["height"]) for b in seen]
+
+
+@pytest.mark.slow
+def test_much_to_say_leaves_the_pictures_in_sight_and_one_page_in_print(serve, browse):
+    """Two runs with findings, notes and 25 branches on a small screen."""
+    pytest.importorskip("gdcm", reason="the runs are JPEG lossless")
+    runs = tuple(of_data("phantom_xa") / name for name in ("IM1.dcm", "IM8.dcm"))
+    given = Order(views=runs, pixel_spacing_mm=0.4)
+    address, _ = serve(lambda desk: desk.add(desk.new_folder("runs"), given).id)
+    page = browse(address, 1280, 800)
+    assert finished(page) == "degraded"
+    canvases = boxes(page, ".view canvas")
+    assert len(canvases) == 3 and all(bottom < 800 for *_, bottom in canvases)
+    rows = page.locator("#lesions tbody tr")
+    listed = [row.inner_text().split() for row in rows.all() if row.is_visible()]
+    assert 3 < len(listed) < rows.count() and all(float(one[1]) >= 20 for one in listed)
+    page.click("#more")
+    assert all(row.is_visible() for row in rows.all())
+    page.click("#more")
+    document = page.pdf(prefer_css_page_size=True, print_background=True)
+    assert document.count(b"/Type /Page\n") + document.count(b"/Type /Page ") == 1
+    assert page.locator(".status details[open]").count() == 0
+    page.emulate_media(media="print")
+    head = page.inner_text("header")
+    assert "IM1.dcm" in head and "IM8.dcm" in head and "printed 20" in head
+    shown = boxes(page, ".view", "#curve", "#lesions", "#status", "#corrections")
+    assert len(shown) == 7
+    for a, b in itertools.combinations(shown, 2):
+        assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1], (a, b)

@@ -8,6 +8,9 @@ const COLUMNS = [
 ];
 export const area = percent => percent === null ? null : 100 * (1 - (1 - percent / 100) ** 2);
 
+/** Branches that are narrowed by less, %, and have no lesion, are listed on demand; the first ones always. */
+const SLIGHT = 20, FEW = 3;
+
 /** Healthy diameter at the narrowing, and at both borders of the lesion where there is one. */
 const reference = row => [fixed(row.reference_diameter_mm, 2),
   (row.proximal_reference_mm ?? null) === null ? "" : el("small", { class: "ends" }, `${fixed(row.proximal_reference_mm, 2)}, ${fixed(row.distal_reference_mm, 2)}`)];
@@ -15,10 +18,10 @@ const reference = row => [fixed(row.reference_diameter_mm, 2),
 /** Fill the table, the most severe narrowing first; erase is called with a branch to delete. */
 export function table(store, erase) {
   const branches = [...store.result.scene.branches].sort((a, b) => (b.stenosis ?? -1) - (a.stenosis ?? -1) || a.branch - b.branch);
-  const rows = branches.map(branch => {
+  const rows = branches.map((branch, rank) => {
     const { row } = branch, percent = row.stenosis_percent;
     const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
-      fixed(row.minimal_diameter_mm, 2), reference(row), fixed(row.lesion_length_mm, 1),
+      fixed(row.minimal_diameter_mm, 2), reference(row), fixed(row.lesion_length_mm || null, 1),
       row.minimal_at_mm === null || branch.from_ostium === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
       row.ghost_probability === null ? "\u2013" : `${Math.round(100 * row.ghost_probability)}`];
     const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
@@ -26,13 +29,21 @@ export function table(store, erase) {
       row.name ? el("small", { title: "probability of the name by anatomy" }, ` ${Math.floor(100 * row.name_confidence)} %`) : "");
     jump.querySelector(".swatch").style.background = colorOf(branch.branch);
     const drop = el("button", { type: "button", class: "small", "aria-label": `Delete branch ${branch.branch}`, title: "Delete this branch (Delete)", onclick: e => { e.stopPropagation(); erase(branch); } }, "Delete");
-    return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : "", onclick: () => jumpTo(store, branch) },
+    return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : rank >= FEW && percent < SLIGHT && !row.lesion_length_mm ? "slight" : "", onclick: () => jumpTo(store, branch) },
       el("td", {}, jump), ...cells.map(content => el("td", {}, content)), el("td", {}, drop));
   });
   $("lesions").replaceChildren(
     el("thead", {}, el("tr", {}, ...COLUMNS.map(([name, unit], k) => el("th", { scope: "col" }, name || (k === 9 ? el("span", { class: "swatch", hidden: true }) : "\u00a0"), el("small", {}, unit))))),
     el("tbody", {}, ...rows));
+  more();
   $("lesion-note").textContent = "Bold: narrower by half or more. Reference: healthy diameter at the narrowing, by a line through the wider parts. Ghost: probability that the branch is not there; dashed from a half on.";
+}
+
+/** Say what is not listed, and offer it. */
+export function more() {
+  const count = $("lesions").querySelectorAll(".slight").length, all = $("lesions").classList.contains("all");
+  $("more").hidden = !count;
+  $("more").textContent = all ? "Narrowings alone" : `and ${count} more, narrowed by less than ${SLIGHT} %`;
 }
 
 /** Choose a branch and mark its narrowing in every drawing. */

@@ -3,7 +3,7 @@ import * as api from "./api.js";
 import { $, el, nameOf } from "./dom.js";
 import { frames } from "./frames.js";
 import { geometry, problem } from "./geometry.js";
-import { Curve, table } from "./lumen.js";
+import { Curve, more, table } from "./lumen.js";
 import { Picture } from "./picture.js";
 import { alternatives, corrections, files, status } from "./report.js";
 import { Scene3D } from "./scene3d.js";
@@ -35,7 +35,7 @@ async function start() {
 }
 function home(desk) {
   api.address(null);
-  $("start").hidden = false; $("case").hidden = true; $("case-tools").hidden = true; $("case-name").textContent = "";
+  $("start").hidden = false; $("case").hidden = true; $("case-tools").hidden = true; $("case-name").textContent = $("names").textContent = "";
   $("earlier").hidden = !desk.cases.length;
   $("cases").replaceChildren(...desk.cases.map(id => el("li", {}, el("button", { type: "button",
     onclick: () => attempt(async () => open(await api.get(`/api/cases/${id}`))) }, id))));
@@ -44,7 +44,7 @@ function home(desk) {
 async function open(info) {
   api.address(info.id);
   $("start").hidden = true; $("case").hidden = false; $("case-tools").hidden = false;
-  $("case-name").textContent = info.id; document.title = `${info.id} \u2013 gcar`;
+  $("case-name").textContent = info.id; $("names").textContent = info.names.map((name, k) => `${k + 1}: ${name}`).join(", "); document.title = `${info.id} \u2013 gcar`;
   scene = new Scene3D(store);
   store.open(info);
   if (info.problem) ask();
@@ -148,6 +148,7 @@ store.addEventListener("chosen", () => { mark(); curve.follow(); pictures.forEac
 
 $("demo").addEventListener("click", () => attempt(async () => open(await api.post("/api/demo"))));
 $("files").addEventListener("change", e => attempt(() => send(e.target.files)));
+$("more").addEventListener("click", () => { $("lesions").classList.toggle("all"); more(); });
 $("home").addEventListener("click", () => attempt(async () => home(await api.get("/api/desk"))));
 $("run").addEventListener("click", run);
 $("cancel").addEventListener("click", () => attempt(() => store.cancel()));
@@ -162,7 +163,14 @@ window.addEventListener("dragover", e => { e.preventDefault(); drop.classList.ad
 window.addEventListener("dragleave", () => drop.classList.remove("over"));
 window.addEventListener("drop", e => { e.preventDefault(); drop.classList.remove("over"); if (e.dataTransfer.files.length) attempt(() => send(e.dataTransfer.files)); });
 window.addEventListener("resize", draw);
-window.addEventListener("beforeprint", () => { document.querySelectorAll(".status .said").forEach(list => { list.open = true; }); draw(); });
+let closed = [];
+window.addEventListener("beforeprint", () => {
+  closed = [...document.querySelectorAll(".status .said:not([open])")];
+  closed.forEach(list => { list.open = true; });
+  $("printed").textContent = `printed ${new Date().toLocaleString("sv-SE").slice(0, 16)}`;
+  draw();
+});
+window.addEventListener("afterprint", () => closed.forEach(list => { list.open = false; }));
 window.matchMedia("print").addEventListener("change", draw);
 
 window.addEventListener("keydown", e => {

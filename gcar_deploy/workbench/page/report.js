@@ -8,13 +8,13 @@ export function status(store) {
   const word = result ? result.summary.status : job.state;
   box.className = `status ${word}`;
   if (!result) { box.replaceChildren(el("b", {}, word), store.words(job.error?.message ?? "")); return; }
-  const { summary } = result, said = [...(summary.findings.length > 1 ? summary.findings : []), ...summary.notes];
+  const { summary } = result, findings = summary.findings.length > 1 ? summary.findings : [];
   const facts = [["views apart", `${summary.separation_deg.toFixed(0)}\u00b0`], ["branches", summary.tree.branches.length],
     ["centreline", `${summary.tree.length_mm.toFixed(0)} mm`], ["time", `${summary.seconds.total.toFixed(1)} s`]];
-  const list = (name, lines, kind) => lines.length ? el("details", { class: kind }, el("summary", {}, `${name} (${lines.length})`), el("ul", {}, ...lines.map(text => el("li", {}, text)))) : null;
+  const list = (name, lines, kind) => lines.length ? el("details", { class: kind }, el("summary", {}, `${name} (${lines.length})`), el("ul", {}, ...lines.map(text => el("li", {}, store.words(text))))) : null;
   box.replaceChildren(el("b", {}, word), summary.sentence,
-    el("div", { class: "facts" }, ...facts.map(([name, value]) => el("span", {}, `${name} `, el("b", {}, String(value))))),
-    ...[list("Findings and notes", said, "said"), list("What no picture can show", summary.silent_errors, "silent")].filter(x => x));
+    el("div", { class: "facts" }, ...facts.map(([name, value]) => el("span", {}, `${name} `, el("b", {}, String(value)))),
+      list("Findings", findings, "said"), list("Notes", summary.notes, "notes"), list("What no picture can show", summary.silent_errors, "silent")));
 }
 
 /** One line a stated alternative, to be looked at and, where a correction picks it, picked. */
