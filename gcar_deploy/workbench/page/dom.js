@@ -66,8 +66,8 @@ export function ring(ctx, x, y, radius, color, dark = "#000") {
   }
 }
 
-// Okabe and Ito's colours, apart for all kinds of colour vision; the darkest made lighter.
-const COLORS = ["#e69f00", "#56b4e9", "#00b386", "#f0e442", "#cc79a7", "#ff7a33", "#8fb8ff", "#ffffff"];
+// Of Tol's and of Okabe and Ito's colours, in an order in which neighbours are apart for all kinds of colour vision.
+const COLORS = ["#eedd88", "#66ccee", "#ee3377", "#bbcc33", "#ffaabb", "#3d8fdb", "#d55e00", "#cc79a7"];
 export const colorOf = branch => COLORS[(branch - 1) % COLORS.length];
 
 /** Name of a branch: its number, and its vessel where anatomy tells it. */
