@@ -385,3 +385,19 @@ def test_what_headers_do_not_say_is_asked_for(ask, desk):
     assert "RAO" not in desk.case(case["id"]).order_file.read_text()
     again = ask("PUT", f"{path}/order", json={"pixel_spacing_mm": None}).json
     assert again["lacks"] == case["lacks"]
+
+
+def test_runs_without_angles_are_asked_for_their_whole_geometry(desk, tmp_path):
+    pytest.importorskip("gdcm", reason="the runs are JPEG lossless")
+    import pydicom
+
+    from gcar_deploy.inputs.order import Order
+
+    views = tuple(tmp_path / name for name in ("IM7.dcm", "IM8.dcm"))
+    for path in views:
+        run = pydicom.dcmread(of_data("phantom_xa") / path.name)
+        del run.PositionerPrimaryAngle
+        run.save_as(path)
+    told = desk.add(desk.new_folder("runs"), Order(views=views)).described()
+    assert "PositionerPrimaryAngle" in told["problem"] and told["lacks"] == {}
+    assert told["sizes"] == [(512, 512)] * 2

@@ -47,7 +47,8 @@ export function problem(store) {
   const { info } = store, lacks = Object.entries(info.lacks);
   if (lacks.length) return `${lacks.map(([key, views]) => `The header of ${views.map(k => info.names[k - 1]).join(" and ")} does not say ${LACKS[key]}.`).join(" ")} Say it below.`;
   if (!info.sizes) return info.problem;
-  if (info.dicom.every(is => is)) return `${info.problem}; or say below where each was taken from.`;
+  // What follows is of the command's options.
+  if (info.dicom.every(is => is)) return `${info.problem.split("; ")[0]}. Say below where each was taken from.`;
   return "These pictures came without their geometry. Say below where each was taken from, or drop them again together with their geom.json.";
 }
 const LACKS = { pixel_spacing_mm: "how large a pixel is at the detector", sod_mm: "how far the source is from the isocentre" };
