@@ -112,7 +112,7 @@ def _changed(now: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[s
                 f"view {one.view_id}: {less / view.mask.sum():.0%} of what looks like vessel has "
                 "no counterpart in the other views: left out as catheter, lead or background"
             )
-        if more:
+        if more >= LEAST_SAID * one.mask.sum() > 0:
             said.append(
                 f"view {one.view_id}: {more / one.mask.sum():.0%} of the vessels look like a "
                 "catheter or lead; they are kept, because the other views show them as well"

@@ -85,13 +85,14 @@ def test_a_part_without_counterpart_is_left_out_and_said():
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.0, []), (0.005, []), (0.02, ["2%"])])
-def test_a_pixel_or_two_that_go_are_no_finding(share, said):
+def test_a_pixel_or_two_that_go_or_come_back_are_no_finding(share, said):
     _, (view, _) = pair()
     edge = np.argwhere(view.mask)[: round(share * view.mask.sum())]
     fewer = view.mask.copy()
     fewer[tuple(edge.T)] = False
-    found = agreement._changed([dataclasses.replace(view, mask=fewer)], [view])
-    assert [text.split()[2] for text in found] == said
+    less = dataclasses.replace(view, mask=fewer)
+    found = [agreement._changed([now], [given]) for now, given in ((less, view), (view, less))]
+    assert [[text.split()[2] for text in texts] for texts in found] == [said, said]
 
 
 def test_a_line_through_the_tree_without_counterpart_is_left_out_and_said():
