@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -98,3 +99,39 @@ def test_the_geometry_page_states_the_formulae_in_use():
     pixels, depth = carm.project([[10.0, -20.0, 30.0]])
     stated = f"pixel ({pixels[0, 0]:.3f}, {pixels[0, 1]:.3f}) at depth {depth[0]:.3f} mm"
     assert stated in (DOCS / "geometry.md").read_text(encoding="utf-8")
+
+
+def printed():
+    """Commands as documents print them, between backticks or indented, without placeholders."""
+    files = [*pages(), ROOT / "README.md", ROOT / "models" / "MODEL_CARD.md"]
+    lines = set()
+    for page in files:
+        text = page.read_text(encoding="utf-8")
+        lines |= set(re.findall(r"`(gcar(?:-export)? [^`]+)`", text.replace("\n", " ")))
+        lines |= set(re.findall(r"^    (gcar(?:-export)? .+)$", text, re.MULTILINE))
+    return sorted(line.split("  #")[0].strip() for line in lines)
+
+
+def test_commands_that_documents_print_are_taken(tool):
+    """But for their files, which nobody has here."""
+    known = dict(tool.commands())
+    asked = 0
+    for line in printed():
+        words = shlex.split(line)
+        depth = next((n for n in (3, 2) if " ".join(words[:n]) in known), 0)
+        name = " ".join(words[:depth])
+        # Placeholders are dots, bars or one capital.
+        if not 0 < depth < len(words) or re.search(r"\.\.\.|\|| [A-Z]( |$)", line):
+            continue
+        asked += 1
+        try:
+            known[name].make_context(name, words[depth:])
+        except click.exceptions.Exit:  # help was asked for
+            continue
+        except click.UsageError as error:
+            said = error.format_message()
+            assert re.search(r"does not exist|Missing (argument|option)|requires an arg", said), (
+                line,
+                said,
+            )
+    assert asked > 60

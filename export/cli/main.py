@@ -152,7 +152,7 @@ def tree_table(data: Path | None, count: int) -> None:
 
 @main.command("lumen-table")
 @click.option("--data", type=FOLDER, help="Folder with imagecas/; left out: generated trees alone.")
-@counted("--count", 30, "Cases, one stenosis each.")
+@counted("--count", 30, "Cases, one stenosis each.", FROM_ZERO)
 @counted("--vessels", 0, "Single vessels of known area, of each kind of picture.", FROM_ZERO)
 @counted("--healthy", 0, "Generated trees without a lesion.", FROM_ZERO)
 def lumen_table(data: Path | None, count: int, vessels: int, healthy: int) -> None:
