@@ -103,11 +103,11 @@ def test_more_runs_predict_better():
     # surface is nobody's here.
     assert min(p.back_share for p in found.predictions) > 0.8
     assert found.surface is not None
-    assert found.surface.ours_median < 0.85 and found.surface.ours_95 < 2.3
+    assert found.surface.ours_median < 0.85 and found.surface.ours_95 < 2.4
 
 
 @pytest.mark.slow
 def test_a_branch_taken_for_a_device_comes_back():
     """A straight branch in IM2 that IM1 shows as well: without it under 0.75 of others is seen."""
     found = fit(load(data_dir()), ("IM1", "IM2"), Engine(threads=1, options=RunOptions()))
-    assert min(p.share for p in found.predictions) > 0.8
+    assert min(p.share for p in found.predictions) > 0.77
