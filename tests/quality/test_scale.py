@@ -10,6 +10,7 @@ import pytest
 
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.quality.duplicates import check_duplicates
@@ -212,3 +213,29 @@ def test_a_whole_run_judges_the_scale(factor, outcome):
     result = engine.reconstruct(pictures, grid)
     assert result.status == outcome, result.quality.sentence
     assert any("mm_per_count" in f for f in result.quality.findings) == (outcome == "degraded")
+
+
+@pytest.mark.parametrize("shape", ["square", "round"])
+@pytest.mark.parametrize("polarity", ["dark", "bright"])
+def test_views_behind_one_collimator_are_two_and_a_copy_behind_it_is_one(shape, polarity):
+    noise = np.random.default_rng(1)
+    side = 256
+    row, column = np.indices((side, side)) - 0.5 * (side - 1)
+    off = np.hypot(row, column) if shape == "round" else np.maximum(abs(row), abs(column))
+
+    def shown(angiogram, tilt):
+        path = cv2.resize(angiogram.pixels, (side, side), interpolation=cv2.INTER_AREA) / 1000
+        grey = (180 + tilt * row / 4) * np.exp(-0.06 * path) + noise.normal(0, 2, path.shape)
+        grey = np.where(off > 0.4 * side, 3.0, grey)
+        grey = grey if polarity == "dark" else 255 - grey
+        return dataclasses.replace(
+            angiogram, pixels=np.clip(grey, 0, 255).astype(np.float32), sha256=str(noise.random()),
+            carm=dataclasses.replace(angiogram.carm, rows=side, columns=side),
+            intensity=Intensity(kind="raw"),
+        )  # fmt: skip
+
+    (first, second), *_ = tiny_case()
+    check_duplicates([shown(first, 0.0), shown(second, 0.2)])
+    copy = dataclasses.replace(shown(first, 0.0), carm=shown(second, 0.0).carm)
+    with pytest.raises(RefusedError, match="same picture"):
+        check_duplicates([shown(first, 0.0), copy])
