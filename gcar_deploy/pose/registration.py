@@ -109,7 +109,7 @@ def register(
     order, hint = order_of(views, rigid, options)
     findings += order
     hint = hint or scale_hint(views, rigid, options)
-    # Pictures that agree far better the other way round are swapped: no heart has moved.
+    # Pictures that are swapped, or of another scale, are told apart by that: no heart has moved.
     poses = rigid if hint else with_motion(views, rigid, options)
     motions = [
         (pose.motion_mm, pose.motion is not None, before.after)

@@ -29,7 +29,7 @@ export function geometry(store, say) {
 
 /** A button for pictures that came in the wrong order: what was drawn in them stays with them. */
 function exchange(store, say, k) {
-  const onclick = async () => {
+  const onclick = () => {
     const told = structuredClone(store.info.geometry), [a, b] = told.views.slice(k, k + 2);
     // What a picture is called and what its counts mean are the picture's own.
     const of = (whole, { id, intensity }) => {
@@ -37,7 +37,7 @@ function exchange(store, say, k) {
       return { ...id !== undefined && { id }, ...placed, ...intensity !== undefined && { intensity } };
     };
     told.views.splice(k, 2, of(b, a), of(a, b));
-    try { await store.change({ geometry: told }); say(""); if (!store.info.problem) await store.run(); } catch (error) { say(error.message); }
+    apply(store, say, { geometry: told });
   };
   return el("button", { type: "button", onclick }, `Exchange the geometry of views ${k + 1} and ${k + 2}`);
 }
@@ -63,13 +63,16 @@ function bare(store, say, k) {
 const blank = ([key, , , least, most, example], id) =>
   el("input", { type: "number", id, name: key, min: least, max: most, step: "any", required: true, placeholder: `e.g. ${example}` });
 const asks = inputs => el("div", { class: "numbers" }, ...inputs.flatMap(([name, unit, input]) => [el("label", { for: input.id }, name), input, el("span", {}, unit)]));
-/** A form whose values become part of the order; then it is run. */
-const form = (store, say, values, ...rest) => el("form", { class: "cards asked", onsubmit: async e => {
-  e.preventDefault();
+/** Make values part of the order, and run it if nothing else is missing. */
+async function apply(store, say, values) {
   try {
-    await store.change(values());
+    await store.change(values);
     if (!store.info.problem) { say(""); await store.run(); }
   } catch (error) { say(error.message); }
+}
+const form = (store, say, values, ...rest) => el("form", { class: "cards asked", onsubmit: e => {
+  e.preventDefault();
+  apply(store, say, values());
 } }, ...rest);
 const titled = (store, k, size = "") => el("h3", {}, `View ${k + 1}: ${store.info.names[k]}${size}`);
 
@@ -120,7 +123,7 @@ async function edit(store, say, k, key, input) {
   if (!input.checkValidity() || input.value === "") { geometry(store, say); say(`View ${k + 1}: ${key} must be ${input.min} .. ${input.max}`); return; }
   const told = structuredClone(store.info.geometry);
   told.views[k][key] = key === "pixel_spacing_mm" ? [value, value] : value;
-  try { await store.change({ geometry: told }); say(""); } catch (error) {
+  try { await store.change({ geometry: told }); if (!store.info.problem) say(""); } catch (error) {
     // What was refused must not stand in its field.
     geometry(store, say);
     say(error.message);
