@@ -18,7 +18,7 @@ import dataclasses
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
+import scipy  # its optimize is imported where it is first used: most runs never need it
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm
@@ -244,7 +244,7 @@ def estimate_motion(
         (2 * options.coarse_mm, PROFILE_NOISE), (options.coarse_mm, PROFILE_NOISE),
         *((options.fine_mm, share * PROFILE_NOISE) for share in NARROWING),
     ):  # fmt: skip
-        x = least_squares(
+        x = scipy.optimize.least_squares(
             residuals, x, jac=slopes, args=(sigma_mm, noise), x_scale=prior,
             ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=MOST_STEPS,
         ).x  # fmt: skip

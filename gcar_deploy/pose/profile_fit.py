@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy  # its optimize is imported where it is first used: most runs never need it
 
 from gcar_deploy.config import PoseOptions
 from gcar_deploy.geometry.carm import CArm
@@ -89,7 +89,7 @@ def fit_profiles(
         return np.stack(ahead, axis=1) / np.diag(steps)
 
     def fitted(x: Array, sigma: float, noise: float) -> tuple[Array, bool]:
-        solution = least_squares(
+        solution = scipy.optimize.least_squares(
             told, x, jac=slopes, args=(sigma, noise), x_scale=prior,
             ftol=TOLERANCE, xtol=TOLERANCE, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip

@@ -13,7 +13,7 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy  # its optimize is imported where it is first used: most runs never need it
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.carm import CArm, separation_deg
@@ -170,7 +170,7 @@ class Pair:
         y = np.zeros(len(free))
         y[0] = self.start
         for sigma_mm in (2 * self.coarse_mm, self.coarse_mm, self.fine_mm):
-            y = least_squares(
+            y = scipy.optimize.least_squares(
                 residuals, y, args=(sigma_mm,), diff_step=1e-2, max_nfev=_MOST_STEPS
             ).x
         return whole(y)

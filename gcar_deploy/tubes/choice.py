@@ -18,12 +18,13 @@ import dataclasses
 import itertools
 
 import numpy as np
+import scipy  # its optimize is imported where it is first used: most runs never need it
 from scipy import ndimage, sparse
-from scipy.optimize import linprog, minimize
 
 from gcar_deploy.tree.edit import kept_branches, part_of
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
+from gcar_deploy.tubes.shares import best_shares
 from gcar_deploy.tubes.support import least_seen
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.types import Array, Points, Scalars
@@ -159,7 +160,7 @@ def weigh_pieces(
     alone = dataclasses.replace(tubes, log_radius=np.log(radius))
     gram, pull = _normal(alone, segment, count, targets)
     cost = PIECE_COST * total * (FAIR_CONFIDENCE - confidence)
-    share = _solve(gram, pull - cost, confidence)
+    share = best_shares(gram, pull - cost, confidence)
     tie = np.abs(share - MIN_SHARE) < TIE
     kept = share >= MIN_SHARE
     if kept.any():
@@ -198,7 +199,7 @@ def wanted_parts(gain: Scalars, joints: Array, part_cost: float) -> Array:
             sparse.csr_matrix((-np.ones(2 * count), (np.arange(2 * count), end.reshape(-1)))),
         ]
     )
-    found = linprog(
+    found = scipy.optimize.linprog(
         np.concatenate([-(gain + part_cost), np.full(len(used), part_cost)]),
         A_ub=needs, b_ub=np.zeros(2 * count), bounds=(0, 1), method="highs",
     )  # fmt: skip
@@ -264,19 +265,6 @@ def _normal(tubes: Tubes, piece: Array, count: int, targets: list[Target]) -> tu
         gram += np.asarray((U.T @ WU).todense())
         pull += WU.T @ target.path_mm.reshape(-1)
     return gram, pull
-
-
-def _solve(gram: Array, pull: Scalars, start: Scalars) -> Scalars:
-    def value(a: Scalars) -> tuple[float, Scalars]:
-        ga = gram @ a
-        return 0.5 * float(a @ ga) - float(pull @ a), ga - pull
-
-    found = minimize(
-        value, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(start),
-        options={"maxiter": 300, "maxcor": 20},
-    )  # fmt: skip
-    out: Scalars = np.clip(found.x, 0.0, 1.0)
-    return out
 
 
 def _weighted_median(values: Scalars, weight: Scalars) -> float:

@@ -98,7 +98,7 @@ def test_a_faint_piece_stays_where_paths_are_estimates_and_others_hang_on_it(
     monkeypatch.setattr(choice, "PIECE_MM", edge)
     monkeypatch.setattr(choice, "TRUSTED_SHARE", 9.0)
     monkeypatch.setattr(choice, "PART_MM", 0.2 * edge)
-    monkeypatch.setattr(choice, "_solve", solved)
+    monkeypatch.setattr(choice, "best_shares", solved)
     targets = make_targets(seen(tree, two_views(), calibrated), 0.0, TubeOptions())
     pieces = choice.weigh_pieces(tree, tubes, tree.radii(), targets)
     assert np.count_nonzero(pieces.share < choice.MIN_SHARE) == lost
@@ -109,7 +109,7 @@ def test_near_ties_are_told_whichever_way_they_fell(monkeypatch):
     tubes = tubes_of(tree)
     monkeypatch.setattr(choice, "PIECE_MM", 1e3)
     monkeypatch.setattr(choice, "TRUSTED_SHARE", 9.0)
-    monkeypatch.setattr(choice, "_solve", lambda *_: np.array([0.9, 0.52, 0.48]))
+    monkeypatch.setattr(choice, "best_shares", lambda *_: np.array([0.9, 0.52, 0.48]))
     targets = make_targets(seen(tree, two_views(), True), 0.0, TubeOptions())
     pieces = choice.weigh_pieces(tree, tubes, tree.radii(), targets)
     assert pieces.tie.tolist() == [False, True, True]
