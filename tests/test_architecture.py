@@ -33,6 +33,7 @@ RUNTIME_FLOORS = (
     "output reconstruct selftest data",
     "result",
     "engine",
+    "engine_choice",
     "inspection worker batch bench",
     "workbench",
     "cli",

@@ -14,7 +14,8 @@ from gcar_deploy.batch.cases import BatchCase
 from gcar_deploy.batch.lock import only_batch
 from gcar_deploy.batch.pools import Pool, in_processes, on_dask
 from gcar_deploy.batch.summary import write_summary
-from gcar_deploy.batch.work import BatchEngine, BatchJob
+from gcar_deploy.batch.work import BatchJob
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 
 SCHEMA = "gcar-batch/1"
@@ -27,7 +28,7 @@ OnCase = Callable[[int, int, str], None]
 def run_batch(
     cases: Sequence[BatchCase],
     out: Path,
-    engine: BatchEngine,
+    engine: EngineChoice,
     *,
     pool: Pool = Pool(),  # noqa: B008 - frozen
     force: bool = False,
@@ -76,7 +77,7 @@ def run_batch(
 
 
 def _known(
-    cases: Sequence[BatchCase], out: Path, rows_folder: Path, engine: BatchEngine, pool: Pool, *,
+    cases: Sequence[BatchCase], out: Path, rows_folder: Path, engine: EngineChoice, pool: Pool, *,
     force: bool,
 ) -> tuple[dict[str, dict[str, Any]], list[BatchJob]]:  # fmt: skip
     """Return the rows that still hold, and the jobs that are left."""

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gcar_deploy.batch.work import BatchEngine
 from gcar_deploy.config import DicomLimits, Landmark
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import digest_of, text_of
 from gcar_deploy.inputs.order import Order, check_views, load_order
@@ -37,7 +37,7 @@ class BatchCase:
     name: str
     order: Order
 
-    def fingerprint(self, engine: BatchEngine) -> str:
+    def fingerprint(self, engine: EngineChoice) -> str:
         """SHA-256 of everything the result depends on; unreadable files count as absent."""
         order = self.order.with_files(lambda _, path: Path(path.name))
         what = {"order": order.to_dict(), "engine": dataclasses.asdict(engine)}

@@ -13,6 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import CancelledError, GcarError, RefusedError
 from gcar_deploy.inputs.order import Order
 
@@ -25,21 +26,6 @@ COLUMNS = (
 _ENDING: ContextVar[Callable[[], bool] | None] = ContextVar("gcar_batch_ending", default=None)
 
 
-@dataclasses.dataclass(frozen=True)
-class BatchEngine:
-    """Which engine does the cases: model files (None for the shipped ones) and threads."""
-
-    model: str | None = None
-    threads: int | None = None
-    segmenter_model: str | None = None
-
-    @property
-    def files(self) -> dict[str, Path]:
-        """Return the model files that are named, each by its role."""
-        named = {"model": self.model, "segmenter_model": self.segmenter_model}
-        return {role: Path(file) for role, file in named.items() if file is not None}
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BatchJob:
     """One case to be done, in plain values that travel between processes.
@@ -48,14 +34,14 @@ class BatchJob:
     ----------
     case : name
     order : with files and result folder by their full paths
-    engine : BatchEngine
+    engine : EngineChoice
     marker : exists while the case runs, so that a process that dies names its case; or None
     fingerprint : of everything the result depends on
     """
 
     case: str
     order: Order
-    engine: BatchEngine
+    engine: EngineChoice
     marker: str | None
     fingerprint: str
 
@@ -111,17 +97,8 @@ def _die_with_parent() -> None:
 
 
 @functools.lru_cache(maxsize=2)
-def _engine(engine: BatchEngine, predictor: str | None) -> Any:
-    from gcar_deploy.config import RunOptions
-    from gcar_deploy.engine import Engine
-
-    options = Order(predictor=predictor).options(RunOptions())
-    return Engine(
-        engine.model,
-        threads=engine.threads,
-        options=options,
-        segmenter_model=engine.segmenter_model,
-    )
+def _engine(engine: EngineChoice, predictor: str | None) -> Any:
+    return engine.engine(Order(predictor=predictor))
 
 
 def _check_wanted() -> None:

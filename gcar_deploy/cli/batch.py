@@ -12,7 +12,6 @@ from pathlib import Path
 import click
 
 from gcar_deploy.cli.common import (
-    EngineChoice,
     Talk,
     engine_options,
     gathered,
@@ -20,6 +19,7 @@ from gcar_deploy.cli.common import (
     talk_options,
 )
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, order_options
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
 
 
@@ -86,7 +86,6 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
     from gcar_deploy.batch.batch import run_batch
     from gcar_deploy.batch.cases import read_cases
     from gcar_deploy.batch.pools import Pool
-    from gcar_deploy.batch.work import BatchEngine
 
     cases = read_cases(table, dataclasses.replace(order, out=None, force=False))
     hidden = talk.quiet or not sys.stderr.isatty()
@@ -94,7 +93,7 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
         rows = run_batch(
             cases,
             order.out,
-            BatchEngine(_full(engine.model), engine.threads, _full(engine.segmenter_model)),
+            engine.absolute(),
             pool=Pool(jobs, where.scheduler),
             force=order.force,
             on_case=lambda done, *_: bar.update(done - bar.pos),
@@ -106,10 +105,6 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
     counts = Counter(row["status"] for row in rows)
     said = ", ".join(f"{number} {status}" for status, number in sorted(counts.items()))
     say_result(f"{order.out}\n{len(rows)} cases: {said}\n{order.out / 'summary.html'}", order.out)
-
-
-def _full(file: str | None) -> str | None:
-    return None if file is None else str(Path(file).absolute())
 
 
 def _cores() -> int:

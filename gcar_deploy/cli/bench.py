@@ -10,7 +10,8 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, ProgressBar, Talk, gathered, talk_options
+from gcar_deploy.cli.common import ProgressBar, Talk, gathered, talk_options
+from gcar_deploy.engine_choice import EngineChoice
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 COLUMNS = (
@@ -71,7 +72,7 @@ def bench(out_dir: Path | None, stages: bool, extent: Extent, force: bool, talk:
     from gcar_deploy.errors import UsageError
 
     talk.set_up()
-    EngineChoice(None, extent.threads).limit_threads()
+    EngineChoice(threads=extent.threads).limit_threads()
     if stages:
         click.echo(_stages(extent.repeats, extent.threads, talk.quiet))
         return

@@ -1,4 +1,4 @@
-"""What several verbs share: logging, the progress bar, which engine does the work."""
+"""What several verbs share: logging, the progress bar, options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import dataclasses
 import functools
 import json
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,11 +14,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from gcar_deploy.engine_choice import EngineChoice
+
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from gcar_deploy.engine import Engine
-    from gcar_deploy.inputs.order import Order
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _WIDTH = 28
@@ -103,38 +101,6 @@ class Talk:
                 }
                 click.echo(json.dumps(found))
             raise
-
-
-@dataclasses.dataclass(frozen=True)
-class EngineChoice:
-    """Which engine does the work: models (None for the shipped ones) and threads."""
-
-    model: str | None
-    threads: int | None
-    segmenter_model: str | None = None
-
-    def limit_threads(self) -> None:
-        """Hold every numerical library of this process; before they are imported."""
-        if self.threads is None:
-            return
-        for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ[name] = str(self.threads)
-        import cv2
-
-        cv2.setNumThreads(self.threads)
-
-    def engine(self, order: Order) -> Engine:
-        """Return an engine set up as an order chooses."""
-        from gcar_deploy.config import RunOptions
-        from gcar_deploy.engine import Engine
-
-        options = order.options(RunOptions())
-        return Engine(
-            self.model,
-            threads=self.threads,
-            options=options,
-            segmenter_model=self.segmenter_model,
-        )
 
 
 def say_result(text: str, folder: Path) -> None:

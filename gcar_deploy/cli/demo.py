@@ -12,8 +12,9 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, say_result, talk_options
+from gcar_deploy.cli.common import Talk, engine_options, say_result, talk_options
 from gcar_deploy.cli.request import METHOD, order_options
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
 
 _FOLDER = Path("gcar-demo")

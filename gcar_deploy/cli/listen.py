@@ -11,7 +11,6 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import (
-    EngineChoice,
     Talk,
     engine_options,
     gathered,
@@ -20,6 +19,7 @@ from gcar_deploy.cli.common import (
     until_stopped,
 )
 from gcar_deploy.cli.request import order_options
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
 
 

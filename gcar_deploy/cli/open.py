@@ -13,7 +13,6 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import (
-    EngineChoice,
     Talk,
     engine_options,
     needs_extra,
@@ -21,6 +20,7 @@ from gcar_deploy.cli.common import (
     talk_options,
 )
 from gcar_deploy.cli.request import METHOD, READING, order_options
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order, check_views
 
 _FOLDER = Path("gcar-cases")

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gcar_deploy.cli.common import EngineChoice, Talk, engine_options, say_result, talk_options
+from gcar_deploy.cli.common import Talk, engine_options, say_result, talk_options
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, READING, order_options
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order, check_views, order_to_json
 
 if TYPE_CHECKING:

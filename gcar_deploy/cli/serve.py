@@ -14,7 +14,6 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import (
-    EngineChoice,
     Talk,
     engine_options,
     gathered,
@@ -23,6 +22,7 @@ from gcar_deploy.cli.common import (
     talk_options,
 )
 from gcar_deploy.cli.request import order_options
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
 
 _LEAST_TOKEN = 16

@@ -20,13 +20,13 @@ from gcar_deploy.batch import pools, work
 from gcar_deploy.batch.batch import run_batch
 from gcar_deploy.batch.cases import read_cases as cases_of
 from gcar_deploy.batch.summary import summary_csv, summary_html
-from gcar_deploy.batch.work import BatchEngine
+from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.inputs.order import Order
 from tests.batch.dying import patient, suicidal
 from tests.cli.conftest import gcar, good_case  # noqa: F401 - a fixture
 
-ENGINE = BatchEngine(threads=1)
+ENGINE = EngineChoice(threads=1)
 LIKE = Order(predictor="none")
 
 
@@ -115,7 +115,7 @@ def test_a_changed_case_is_not_passed_off_as_the_old_one(table, tmp_path, monkey
     cases = [case for case in read_cases(table) if case.name in ("twice", "bad-geometry")]
     run_batch(cases, tmp_path / "out", ENGINE)
     with pytest.raises(UsageError, match=r"'twice'.*--force"):
-        run_batch(cases, tmp_path / "out", BatchEngine(threads=2))
+        run_batch(cases, tmp_path / "out", EngineChoice(threads=2))
     unrefined = read_cases(table, Order(predictor="none", refiner="none"))
     with pytest.raises(UsageError, match=r"'twice'.*--force"):
         run_batch([c for c in unrefined if c.name == "twice"], tmp_path / "out", ENGINE)
@@ -130,7 +130,7 @@ def test_a_model_file_that_changed_is_another_engine(table, tmp_path, monkeypatc
     (case,) = (case for case in read_cases(table) if case.name == "missing")
     file = tmp_path / "mine.onnx"
     file.write_bytes(b"first")
-    engine = BatchEngine(threads=1, **{role: str(file)})
+    engine = EngineChoice(threads=1, **{role: str(file)})
     rows = run_batch([case], tmp_path / "out", engine)
     assert run_batch([case], tmp_path / "out", engine) == rows
     file.write_bytes(b"second")
@@ -186,7 +186,7 @@ def test_a_process_that_dies_costs_only_its_own_case(tmp_path, monkeypatch):
     monkeypatch.setattr(pools, "run_case", suicidal)
     jobs = [
         work.BatchJob(
-            case=name, order=Order(), engine=BatchEngine(), marker=str(tmp_path / name),
+            case=name, order=Order(), engine=EngineChoice(), marker=str(tmp_path / name),
             fingerprint="f",
         )
         for name in ("a", "killer", "b", "c")
@@ -204,7 +204,7 @@ def rows_of_interrupted(tmp_path, monkeypatch, *, times):
     names = ("a", "b", "c", "d")
     jobs = [
         work.BatchJob(
-            case=name, order=Order(), engine=BatchEngine(), marker=str(tmp_path / name),
+            case=name, order=Order(), engine=EngineChoice(), marker=str(tmp_path / name),
             fingerprint="stubborn" if times > 1 else "f",
         )
         for name in names
@@ -384,6 +384,6 @@ def test_rows_travel_between_processes():
 
     job = work.BatchJob(
         case="a", order=Order(views=(Path("v"),), geometry=Path("g"), out=Path("o")),
-        engine=BatchEngine(threads=1), marker=None, fingerprint="f",
+        engine=EngineChoice(threads=1), marker=None, fingerprint="f",
     )  # fmt: skip
     assert pickle.loads(pickle.dumps(job)) == job  # noqa: S301
