@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
 from gcar_export.evaluate.jobs import NO_CASE, Job, case_name, row_path, write_done
@@ -92,8 +93,9 @@ class EvaluateOptions:
         unknown = [m for m in self.methods if m not in METHODS]
         if unknown or not self.methods:
             raise UsageError(f"unknown method {unknown}; there are {', '.join(METHODS)}")
-        if not self.views or any(not 2 <= n <= 16 for n in self.views):
-            raise UsageError(f"views = {self.views!r} must be numbers from 2 to 16")
+        if not self.views or any(not LEAST_VIEWS <= n <= MOST_VIEWS for n in self.views):
+            taken = f"numbers from {LEAST_VIEWS} to {MOST_VIEWS}"
+            raise UsageError(f"views = {self.views!r} must be {taken}")
         if self.jobs < 1:
             raise UsageError(f"jobs = {self.jobs} must be at least 1")
         if self.reference is not None and self.reference not in self.methods:

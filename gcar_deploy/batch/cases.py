@@ -17,12 +17,12 @@ from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import digest_of, text_of
 from gcar_deploy.inputs.order import Order, check_views, load_order
-from gcar_deploy.inputs.words import parse_frames, parse_landmark
+from gcar_deploy.inputs.words import VIEW_NUMBER, parse_frames, parse_landmark
 
 #: names become folders
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _VIEW = re.compile(r"view([1-9][0-9]?)")
-_MASK = re.compile(r"mask([1-9]|1[0-6])")
+_MASK = re.compile(rf"mask({VIEW_NUMBER})")
 #: what a batch itself puts beside its cases
 _RESERVED = re.compile(r"rows|batch\.json|summary\.(csv|html)(\.partial)?", re.IGNORECASE)
 MOST_CASES = 100_000

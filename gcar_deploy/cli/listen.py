@@ -20,6 +20,7 @@ from gcar_deploy.cli.common import (
 )
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.engine_choice import EngineChoice
+from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
 from gcar_deploy.inputs.order import Order
 
 
@@ -46,7 +47,7 @@ _SERVICE = {
         help="Send surface, overlays and measurements back into the study by C-STORE.",
     ),
     "runs": click.option(
-        "--runs", type=click.IntRange(2, 16), default=2, show_default=True,
+        "--runs", type=click.IntRange(LEAST_VIEWS, MOST_VIEWS), default=2, show_default=True,
         help="A study with so many runs is reconstructed.",
     ),
     "title": click.option(

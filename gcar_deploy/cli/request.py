@@ -11,7 +11,8 @@ from typing import Any, TypeAlias, TypeVar
 import click
 
 from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions
-from gcar_deploy.inputs.order import MOST_VIEWS, POSES, Order, load_order
+from gcar_deploy.geometry.fields import MOST_VIEWS
+from gcar_deploy.inputs.order import EXTRAS, POSES, Order, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_lesion, parse_mask
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -100,7 +101,8 @@ READING = (
 )  # fmt: skip
 #: what tells how a tree is made of them
 METHOD = ("predictor", "refiner", "deadline_s")
-EXTRA_FILES = ("glb", "dicom_stl")
+#: options that ask for further files
+EXTRA_FILES = {name.replace("-", "_"): name for name in EXTRAS}
 #: the old spelling of --mask, still understood
 _SHORT_MASKS = {f"mask{k}": k for k in range(1, MOST_VIEWS + 1)}
 
@@ -142,7 +144,7 @@ def made_order(said: Mapping[str, Any]) -> Order:
     file = values.pop("file", None)
     masks = dict(parse_mask(text) for text in values.pop("masks", ()))
     masks |= {k: values.pop(name) for name, k in _SHORT_MASKS.items() if name in values}
-    extras = [name for name in ("glb", "dicom-stl") if values.pop(name.replace("-", "_"), False)]
+    extras = [name for option, name in EXTRA_FILES.items() if values.pop(option, False)]
     if masks:
         values["masks"] = masks
     if extras:

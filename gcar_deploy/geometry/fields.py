@@ -14,6 +14,8 @@ from typing import Any
 from gcar_deploy.errors import GeometryError
 
 MAX_BYTES = 64 * 1024
+#: views of one scene, pictures of one order
+LEAST_VIEWS, MOST_VIEWS = 2, 16
 #: a wrong value is quoted up to this many characters
 MAX_QUOTE = 80
 

@@ -17,7 +17,9 @@ from gcar_deploy.errors import GeometryError
 from gcar_deploy.files import read_text
 from gcar_deploy.geometry.carm import CLINICAL_RANGES, CArm
 from gcar_deploy.geometry.fields import (
+    LEAST_VIEWS,
     MAX_BYTES,
+    MOST_VIEWS,
     check_choice,
     check_object,
     number,
@@ -29,7 +31,6 @@ from gcar_deploy.geometry.fields import (
 from gcar_deploy.geometry.grid import Grid
 
 SCHEMA = "gcar-geometry/1"
-MIN_VIEWS, MAX_VIEWS = 2, 16
 KINDS = ("path_length", "attenuation", "raw", "mask")
 POLARITIES = ("auto", "dark", "bright")
 #: the default volume: voxels along each edge
@@ -242,9 +243,9 @@ def _scene(data: Any) -> Scene:
     views = data.get("views")
     if not isinstance(views, list):
         raise GeometryError("views is missing or not a list")
-    if not MIN_VIEWS <= len(views) <= MAX_VIEWS:
+    if not LEAST_VIEWS <= len(views) <= MOST_VIEWS:
         raise GeometryError(
-            f"views holds {len(views)} entries, {MIN_VIEWS} .. {MAX_VIEWS} are needed"
+            f"views holds {len(views)} entries, {LEAST_VIEWS} .. {MOST_VIEWS} are needed"
         )
     parsed: list[View] = []
     for k, entry in enumerate(views):

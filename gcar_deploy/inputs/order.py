@@ -25,6 +25,8 @@ from gcar_deploy.config.ranges import Range, check_field, check_number
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.files import read_text
 from gcar_deploy.geometry.fields import (
+    LEAST_VIEWS,
+    MOST_VIEWS,
     check_choice,
     check_object,
     number,
@@ -45,14 +47,13 @@ from gcar_deploy.inputs.drawn import (
 )
 
 SCHEMA = "gcar-order/1"
-#: pictures of one order
-MOST_VIEWS = 16
 #: bytes of an order as JSON: hours of drawing in the pictures may stand in it
 MAX_BYTES = 16 * 1024 * 1024
 #: a branch to be deleted is named by a place within so much of the isocentre, mm
 _FARTHEST_MM = 2000.0
 POSES = ("auto", "off")
-EXTRAS = ("glb", "dicom-stl")
+#: further file that an order may ask for -> its name in the result folder
+EXTRAS = {"glb": "surface.glb", "dicom-stl": "surface.dcm"}
 _CHOICES = {
     "pose": POSES, "segmenter": SEGMENTERS, "predictor": PREDICTORS, "refiner": REFINERS,
 }  # fmt: skip
@@ -122,7 +123,7 @@ class Order:
             if getattr(self, key) is not None:
                 _as_usage(check_choice, key, getattr(self, key), choices)
         for extra in self.extras:
-            _as_usage(check_choice, "extras", extra, EXTRAS)
+            _as_usage(check_choice, "extras", extra, tuple(EXTRAS))
         for key in ("frames", "pixel_spacing_mm", "sod_mm"):
             if getattr(self, key) is not None:
                 check_field(DicomOptions, key, getattr(self, key))
@@ -258,8 +259,8 @@ def _order(values: Any) -> Order:
         raise UsageError(f"schema = {quote(values['schema'])} must be {SCHEMA!r}")
     given = {k: v for k, v in values.items() if v is not None and k != "schema"}
     names = _list("views", given.get("views"), "file names")
-    if not 2 <= len(names) <= MOST_VIEWS:
-        raise UsageError(f"views has {len(names)} entries; 2 .. {MOST_VIEWS} are taken")
+    if not LEAST_VIEWS <= len(names) <= MOST_VIEWS:
+        raise UsageError(f"views has {len(names)} entries; {LEAST_VIEWS} .. {MOST_VIEWS} are taken")
     given["views"] = tuple(_path("views", name) for name in names)
     readers: dict[str, Callable[[str, Any], Any]] = {
         "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,

@@ -8,9 +8,12 @@ from pathlib import Path
 
 from gcar_deploy.config import Landmark, LesionBorders
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.fields import MOST_VIEWS
 
-_LESION = re.compile(r"([1-9]|1[0-6]):([^:]+):([^:]+)")
-_MASK = re.compile(r"([1-9]|1[0-6]):(.+)", re.DOTALL)
+#: pattern of the number of a view
+VIEW_NUMBER = "|".join(str(k) for k in range(1, MOST_VIEWS + 1))
+_LESION = re.compile(rf"({VIEW_NUMBER}):([^:]+):([^:]+)")
+_MASK = re.compile(rf"({VIEW_NUMBER}):(.+)", re.DOTALL)
 
 
 def parse_frames(text: str) -> tuple[int | None, ...]:
@@ -80,5 +83,7 @@ def parse_mask(text: str) -> tuple[int, Path]:
     """
     found = _MASK.fullmatch(text)
     if found is None:
-        raise UsageError(f"mask {text[:60]!r} must be N:FILE, N the number of the view (1 .. 16)")
+        raise UsageError(
+            f"mask {text[:60]!r} must be N:FILE, N the number of the view (1 .. {MOST_VIEWS})"
+        )
     return int(found[1]), Path(found[2])

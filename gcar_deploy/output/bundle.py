@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.inputs.order import EXTRAS
 from gcar_deploy.output.folder import listed, write_folder
 from gcar_deploy.output.overlay import Backdrop, backdrop, overlay, png_bytes
 from gcar_deploy.output.report import report_html
@@ -23,11 +24,9 @@ from gcar_deploy.output.volume import nifti_bytes
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.tree.surface import lumen_surface, stl_bytes
 
-RESULT_NAME = "result.json"
+RESULT_FILE = "result.json"
 #: lattice of the lumen surface: finer than a section every 0.8 mm, and still a few megabytes
 SURFACE_EDGE_MM = 0.4
-#: files that are written when asked for
-EXTRAS = {"glb": "surface.glb", "dicom-stl": "surface.dcm"}
 
 
 def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str, bytes]:
@@ -37,7 +36,7 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
 
     Parameters
     ----------
-    extras : names of ``EXTRAS``
+    extras : names of ``inputs.order.EXTRAS``
 
     Raises
     ------
@@ -82,7 +81,7 @@ def render_files(result: Reconstruction, extras: Sequence[str] = ()) -> dict[str
     page = report_html(result, summary, [behind.picture for behind, _ in pictures])
     files["report.html"] = page.encode("utf-8")
     summary["files"] = listed(files)
-    files[RESULT_NAME] = (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode("utf-8")
+    files[RESULT_FILE] = (json.dumps(summary, indent=1, allow_nan=False) + "\n").encode("utf-8")
     return files
 
 
@@ -106,7 +105,7 @@ def check_extras(extras: Sequence[str]) -> None:
 def write_result(
     result: Reconstruction, out_dir: Path, *, force: bool = False, extras: Sequence[str] = ()
 ) -> Path:
-    """Write the result folder, with the files of ``extras`` (names of ``EXTRAS``) in it.
+    """Write the result folder, with the files of ``extras`` in it; see ``render_files``.
 
     Raises
     ------

@@ -41,7 +41,7 @@ NEWTON_STEPS, LEAST_GAIN = 60, 1e-6
 #: differences of profiles that are kept, some 10 kB each
 MOST_KNOWN = 256
 #: more views than this are corrected pair by pair alone
-MOST_VIEWS = 4
+MOST_JOINT_VIEWS = 4
 #: pairs that disagree by no more than this as they are told, are left alone (four views of one
 #: tree, exactly placed, pixels of 1.4 mm: up to 0.08)
 AGREED = 0.09
@@ -77,7 +77,7 @@ def estimate_jointly(
     """
     seen = {k: mass for k, mass in enumerate(masses) if mass is not None}
     problem = _Problem(seen, options, marks)
-    if len(problem.pairs) < 3 or len(seen) > MOST_VIEWS:
+    if len(problem.pairs) < 3 or len(seen) > MOST_JOINT_VIEWS:
         return first, True
     if not first.any() and max(problem.disagreements(first)) <= AGREED:
         return first, True

@@ -20,8 +20,9 @@ from gcar_deploy import __version__
 from gcar_deploy.dicom.choose import choose_frame, filling_and_motion
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.files import natural_order
+from gcar_deploy.geometry.fields import MOST_VIEWS
 from gcar_deploy.inputs.drawn import parse_point
-from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
+from gcar_deploy.inputs.order import parse_order
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.workbench.case import RESULT_NAME, Case
 from gcar_deploy.workbench.desk import Desk

@@ -15,8 +15,8 @@ from werkzeug.datastructures import FileStorage
 from gcar_deploy import __version__
 from gcar_deploy.errors import GeometryError, UsageError
 from gcar_deploy.files import text_of
-from gcar_deploy.geometry.fields import read_json
-from gcar_deploy.inputs.order import MOST_VIEWS, parse_order
+from gcar_deploy.geometry.fields import MOST_VIEWS, read_json
+from gcar_deploy.inputs.order import parse_order
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError

@@ -19,7 +19,8 @@ from pynetdicom import AE, evt
 
 from gcar_deploy.dicom.header import CLASSIC, ENHANCED, SYNTAXES
 from gcar_deploy.errors import GcarError, UsageError
-from gcar_deploy.inputs.order import MOST_VIEWS, Order
+from gcar_deploy.geometry.fields import MOST_VIEWS
+from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.jobs import Job, JobQueue
 from gcar_deploy.worker.orders import Received
 from gcar_deploy.worker.scratch import drop_scratch, new_scratch

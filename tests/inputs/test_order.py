@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from gcar_deploy.config import (
     check_options,
 )
 from gcar_deploy.errors import UsageError
+from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
 from gcar_deploy.inputs.drawn import DOES, Stroke
 from gcar_deploy.inputs.order import (
     EXTRAS,
@@ -77,7 +79,7 @@ def orders(draw) -> Order:
         strict=draw(st.booleans()),
         force=draw(st.booleans()),
         out=draw(st.none() | _names),
-        extras=tuple(draw(st.lists(st.sampled_from(EXTRAS), unique=True))),
+        extras=tuple(draw(st.lists(st.sampled_from(sorted(EXTRAS)), unique=True))),
     )
 
 
@@ -120,12 +122,6 @@ def test_what_an_order_leaves_open_is_as_the_engine_was_set_up():
         predictor="none", refiner="paper", pose="off", sod_mm=700, allow_rescale=True
     ).options(RunOptions())
     assert Order(views=(Path("a"), Path("b"))).options(base) == base
-
-
-def test_every_extra_file_is_one_that_is_written():
-    from gcar_deploy.output.bundle import EXTRAS as FILES
-
-    assert set(EXTRAS) == set(FILES)
 
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="Windows names files by such halves too")
@@ -219,7 +215,8 @@ def test_the_worker_describes_every_key():
     from importlib import resources
 
     text = resources.files("gcar_deploy.worker").joinpath("openapi.json").read_text("utf-8")
-    schemas = json.loads(text)["components"]["schemas"]
+    document = json.loads(text)
+    schemas = document["components"]["schemas"]
     said = schemas["Order"]["allOf"]
     known = set(said[1]["properties"]) | set(schemas["Options"]["properties"])
     assert known == set(KEYS)
@@ -230,3 +227,11 @@ def test_the_worker_describes_every_key():
     ):  # fmt: skip
         assert set(options[key]["enum"]) == {*choices, None}
     assert options["extras"]["items"]["enum"] == list(EXTRAS)
+    form = document["paths"]["/v1/reconstruct"]["post"]["requestBody"]["content"]
+    parts = form["multipart/form-data"]["schema"]
+    for views in (parts["properties"]["view"], said[1]["properties"]["views"]):
+        assert (views["minItems"], views["maxItems"]) == (LEAST_VIEWS, MOST_VIEWS)
+    for masks, start in ((parts, "mask"), (said[1]["properties"]["masks"], "")):
+        (pattern,) = masks["patternProperties"]
+        taken = [k for k in range(100) if re.search(pattern, f"{start}{k}")]
+        assert taken == list(range(1, MOST_VIEWS + 1))
