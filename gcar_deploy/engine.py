@@ -16,7 +16,7 @@ from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.net import Segmenter, load_segmenter
 from gcar_deploy.inputs.drawn import Drawn
-from gcar_deploy.inputs.order import Order, check_views
+from gcar_deploy.inputs.order import Order, check_view_numbers
 from gcar_deploy.inputs.pictures import Geometry, Mask, Picture, prepare
 from gcar_deploy.output.bundle import check_extras
 from gcar_deploy.output.folder import check_target
@@ -172,7 +172,7 @@ class Engine:
         ------
         As ``reconstruct``, and ModelError where the order's predictor or segmenter is not there.
         """
-        check_views(order)
+        check_view_numbers(order)
         limits = [limit for limit in (order.deadline_s, limit_s) if limit is not None]
         options = order.options(self.options)
         deadline_s = min(limits, default=None)

@@ -224,10 +224,10 @@ class MethodSettings:
 @functools.cache
 def _model_hashes(predictor: str) -> dict[str, str]:
     """SHA-256 of the shipped models that a predictor may use, by file name."""
-    from gcar_deploy.predict.kinds import PREDICTORS
+    from gcar_deploy.predict.kinds import PREDICTOR_KINDS
 
     kinds = {"auto": ("multi",), "none": ()}.get(predictor, (predictor,))
-    paths = [PREDICTORS[kind].path for kind in kinds]
+    paths = [PREDICTOR_KINDS[kind].path for kind in kinds]
     return {p.name: _sha256(p) for p in paths if p is not None}
 
 

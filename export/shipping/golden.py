@@ -23,7 +23,7 @@ from gcar_deploy.predict.center_map import net_picture
 from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.encoding import encode, flat_inputs, input_names
 from gcar_deploy.predict.hull import Candidates, visual_hull
-from gcar_deploy.predict.kinds import PREDICTORS
+from gcar_deploy.predict.kinds import PREDICTOR_KINDS
 from gcar_deploy.selftest import tiny_case
 
 #: points of the case: enough for every level and for rays of several points, small on disk
@@ -90,7 +90,7 @@ def write_golden(model: Path, *, force: bool = False) -> Path:
 
 def _opened(path: Path) -> Session:
     """Open a model of any kind."""
-    file = read_model(path, (*PREDICTORS.values(), SEGMENTER))
+    file = read_model(path, (*PREDICTOR_KINDS.values(), SEGMENTER))
     if file.kind == SEGMENTER.name:
         return open_segmenter(path, threads=1).session
     return open_predictor(file, threads=1).session

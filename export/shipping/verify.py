@@ -11,7 +11,7 @@ from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.imaging.net import Segmenter, open_segmenter
 from gcar_deploy.models import read_model
 from gcar_deploy.predict.center_predictor import open_predictor
-from gcar_deploy.predict.kinds import PAPER, PREDICTORS
+from gcar_deploy.predict.kinds import PAPER, PREDICTOR_KINDS
 from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.task_check import REACH_PIXELS, scores
 from gcar_export.training.terms import license_text
@@ -32,7 +32,7 @@ def verify_model(path: Path, scenes: int) -> str:
     """
     from gcar_deploy.cli.model_card import card
 
-    model = read_model(path, (*PREDICTORS.values(), SEGMENTER))
+    model = read_model(path, (*PREDICTOR_KINDS.values(), SEGMENTER))
     license_text(model.name, model.spec, "")
     found: dict[str, list[float]] = {}
     named = "Dice at 0.5 on the hull"

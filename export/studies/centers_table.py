@@ -16,7 +16,7 @@ from gcar_deploy.predict.center_map import net_picture
 from gcar_deploy.predict.center_predictor import Predictor, SingleViewPredictor, open_predictor
 from gcar_deploy.predict.centers import Seen
 from gcar_deploy.predict.encoding import flat_inputs, input_names
-from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
+from gcar_deploy.predict.kinds import PREDICTOR_KINDS, read_predictor
 from gcar_deploy.types import Array
 from gcar_export.evaluate.evaluate import find_labels
 from gcar_export.methods.predictor_process import peak_mib
@@ -93,7 +93,7 @@ def open_models(names: Sequence[str]) -> list[Model]:
     for k, name in enumerate(names):
         if name in names[:k]:
             raise UsageError(f"models: {name} is named twice")
-        path = PREDICTORS[name].path if name in PREDICTORS else Path(name)
+        path = PREDICTOR_KINDS[name].path if name in PREDICTOR_KINDS else Path(name)
         if path is None:
             raise UsageError(f"no {name} model is installed; give the path of one")
         label = files[k] if files.count(files[k]) == 1 else name

@@ -16,7 +16,7 @@ from gcar_deploy.config import DicomLimits, Landmark
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import digest_of, text_of
-from gcar_deploy.inputs.order import Order, check_views, load_order
+from gcar_deploy.inputs.order import Order, check_view_numbers, load_order
 from gcar_deploy.inputs.words import VIEW_NUMBER, parse_frames, parse_landmark
 
 #: names become folders
@@ -137,7 +137,7 @@ def _case(
             masks={**base.masks, **masks},
             **{COLUMNS[k][0]: COLUMNS[k][1](v) for k, v in told.items() if k in COLUMNS and v},
         )
-        check_views(order)
+        check_view_numbers(order)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from None
     return BatchCase(name, order.relative_to(table.parent))

@@ -83,22 +83,22 @@ def processor() -> dict[str, Any]:
 def models() -> list[dict[str, Any]]:
     """Name, hash and golden case of every model that comes along, or why it is unfit."""
     from gcar_deploy.imaging.net import KIND as SEGMENTER
-    from gcar_deploy.predict import PREDICTORS
+    from gcar_deploy.predict import PREDICTOR_KINDS
 
-    return [_model(kind) for kind in (*PREDICTORS.values(), SEGMENTER)]
+    return [_model(kind) for kind in (*PREDICTOR_KINDS.values(), SEGMENTER)]
 
 
 def _model(kind: Kind) -> dict[str, Any]:
     from gcar_deploy.errors import ModelError
     from gcar_deploy.imaging.net import open_segmenter
     from gcar_deploy.models import check_graph
-    from gcar_deploy.predict import PREDICTORS, open_predictor, read_predictor
+    from gcar_deploy.predict import PREDICTOR_KINDS, open_predictor, read_predictor
 
     out = {"name": kind.shipped, "sha256": None, "sound": False, "golden": None}
     if kind.path is None:
         return {**out, "sentence": "not installed"}
     try:
-        if kind.name in PREDICTORS:
+        if kind.name in PREDICTOR_KINDS:
             session = open_predictor(read_predictor(kind.path), threads=1).session
         else:
             session = open_segmenter(kind.path, threads=1).session

@@ -21,7 +21,7 @@ from gcar_deploy.cli.common import (
 )
 from gcar_deploy.cli.request import METHOD, READING, order_options
 from gcar_deploy.engine_choice import EngineChoice
-from gcar_deploy.inputs.order import Order, check_views
+from gcar_deploy.inputs.order import Order, check_view_numbers
 
 _FOLDER = Path("gcar-cases")
 
@@ -118,7 +118,7 @@ def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
         order = _of_folder(order, folder)
     elif len(views) == 1 and not views[0].exists():
         raise ImageError(f"{views[0]}: no such file or folder; check the path")
-    check_views(order)
+    check_view_numbers(order)
     for path in order.files.values():
         # The page would open, and show that nothing is there.
         if not path.exists():

@@ -11,7 +11,7 @@ import click
 from gcar_deploy.cli.common import Talk, engine_options, say_result, talk_options
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, READING, order_options
 from gcar_deploy.engine_choice import EngineChoice
-from gcar_deploy.inputs.order import Order, check_views, order_to_json
+from gcar_deploy.inputs.order import Order, check_view_numbers, order_to_json
 
 if TYPE_CHECKING:
     from gcar_deploy.steps import OnStep
@@ -47,7 +47,7 @@ def run(
       gcar run --order order.json --force
     """  # noqa: D301 - click wants a real backspace
     talk.set_up()
-    check_views(order)
+    check_view_numbers(order)
     if print_order:
         # Wherever the text is put, it names the same files.
         click.echo(order_to_json(order.relative_to(Path.cwd())), nl=False)

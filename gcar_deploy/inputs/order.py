@@ -232,7 +232,7 @@ def order_to_json(order: Order) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def check_views(order: Order) -> None:
+def check_view_numbers(order: Order) -> None:
     """Refuse an order that has too few or too many views, or a mask without its view.
 
     Raises
@@ -274,7 +274,7 @@ def _order(values: Any) -> Order:
         if key in given:
             given[key] = read(key, given[key])
     order = Order(**given)
-    check_views(order)
+    check_view_numbers(order)
     return order
 
 

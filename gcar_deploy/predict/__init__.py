@@ -15,10 +15,10 @@ from gcar_deploy.predict.centers import (
     seen_by_all,
 )
 from gcar_deploy.predict.hull import bilinear
-from gcar_deploy.predict.kinds import PREDICTORS, read_predictor
+from gcar_deploy.predict.kinds import PREDICTOR_KINDS, read_predictor
 
 __all__ = [
-    "PREDICTORS",
+    "PREDICTOR_KINDS",
     "Centers",
     "Evidence",
     "Predictor",

@@ -17,7 +17,7 @@ from gcar_deploy.models import Kind, ModelFile, Session
 from gcar_deploy.predict.center_map import OUTPUTS, ViewCenters, decode, net_picture
 from gcar_deploy.predict.encoding import Encoded, flat_inputs, input_names
 from gcar_deploy.predict.hull import Candidates
-from gcar_deploy.predict.kinds import MULTI, PAPER, PREDICTORS, read_predictor
+from gcar_deploy.predict.kinds import MULTI, PAPER, PREDICTOR_KINDS, read_predictor
 from gcar_deploy.types import Image
 
 _log = logging.getLogger(__name__)
@@ -173,4 +173,4 @@ def missing_predictor(wanted: str) -> str:
 
 
 def _shipped(wanted: str) -> Kind:
-    return PREDICTORS.get(wanted, MULTI)
+    return PREDICTOR_KINDS.get(wanted, MULTI)

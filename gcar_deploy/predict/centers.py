@@ -106,11 +106,11 @@ def seen_by_all(
     spec = predictor.model.spec if isinstance(predictor, CenterPredictor) else None
     wanted = resolution(views, grid, options, spec)
     found = _hull_in(grid, views, wanted, options.candidates)
-    left = [] if grid.bounds else [uncovered_mm(view, found.hull) for view in views]
+    left = [] if grid.bounds else [_missed_mm(view, found.hull) for view in views]
     if max(left, default=0.0) > BESIDE_MM:
         space = common_field(grid, [view.carm for view in views])
         wider = _hull_in(space, views, wanted, options.candidates)
-        now = (uncovered_mm(view, wider.hull) for view in views)
+        now = (_missed_mm(view, wider.hull) for view in views)
         if max(a - b for a, b in zip(left, now, strict=True)) > BESIDE_MM:
             found = wider
     hull = without_ghosts(found.hull, views, options.same_branch)
@@ -118,7 +118,7 @@ def seen_by_all(
     return Seen(tuple(views), sampled, hull, encode(hull, sampled), found.candidates)
 
 
-def uncovered_mm(view: VesselImage, hull: Candidates) -> float:
+def _missed_mm(view: VesselImage, hull: Candidates) -> float:
     """Length of a picture's lines on which no candidate falls, mm at the isocentre."""
     rows, columns = view.mask.shape
     pixels = np.rint(view.carm.project(hull.points_mm)[0])

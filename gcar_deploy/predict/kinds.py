@@ -52,9 +52,9 @@ PAPER = Kind(
     _unfit_picture,
 )
 #: by the name of their kind
-PREDICTORS = {kind.name: kind for kind in (MULTI, PAPER)}
+PREDICTOR_KINDS = {kind.name: kind for kind in (MULTI, PAPER)}
 
 
 def read_predictor(path: Path, limits: ModelLimits | None = None) -> ModelFile:
     """Read and verify a centre predictor of either kind; see ``models.read_model``."""
-    return read_model(path, tuple(PREDICTORS.values()), limits)
+    return read_model(path, tuple(PREDICTOR_KINDS.values()), limits)

@@ -64,7 +64,7 @@ class Stretch:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Exchange:
+class TrialExchange:
     """Two branches that may change partners beyond a crossing.
 
     Attributes
@@ -90,7 +90,7 @@ class Exchange:
         return merged(Tree(nodes_mm=np.array(nodes), branches=tuple(branches)))
 
 
-def exchanges(tree: Tree, carms: Sequence[CArm]) -> list[Exchange]:
+def trial_exchanges(tree: Tree, carms: Sequence[CArm]) -> list[TrialExchange]:
     """Find the stretches beyond crossings in either of two views that could be exchanged."""
     out = []
     for view, *places in _crossings(tree, carms):
@@ -104,7 +104,7 @@ def exchanges(tree: Tree, carms: Sequence[CArm]) -> list[Exchange]:
             # In the view of the crossing each takes the other's line.
             here[view], there[view] = there[view], here[view]
             courses = _course(carms, here), _course(carms, there)
-            out.append(Exchange((one.stretch, other.stretch), courses))
+            out.append(TrialExchange((one.stretch, other.stretch), courses))
     return out
 
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.edit import kept_branches
 from gcar_deploy.tree.tree import Tree
-from gcar_deploy.tubes.exchange import Exchange, cost_beside, costs, exchanges
+from gcar_deploy.tubes.exchange import TrialExchange, cost_beside, costs, trial_exchanges
 from gcar_deploy.tubes.gauss_newton import empty_objective, rescaled
 from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
 from gcar_deploy.tubes.model import Shown
@@ -115,13 +115,13 @@ def _with_partners(
     return now
 
 
-def _doubted(now: State, loss: float, targets: list[Target], run: Run) -> list[Exchange]:
+def _doubted(now: State, loss: float, targets: list[Target], run: Run) -> list[TrialExchange]:
     """Return the exchanges that stand to gain, those of the worst explained stretches first."""
     told = all(target.calibrated or target.shown == "width" for target in targets)
     if len(targets) != 2 or not told or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
         return []
     by: Shown = "path" if _exact(targets) else "width"
-    found = exchanges(now.tree, [target.carm for target in targets])
+    found = trial_exchanges(now.tree, [target.carm for target in targets])
     if not found:
         return []
     pictures, asked = costs(targets, now.prints, run.options), []

@@ -24,7 +24,7 @@ from gcar_deploy.config import ImagingOptions, RunOptions
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.inputs.pictures import prepare
-from gcar_deploy.predict.kinds import MULTI, PREDICTORS
+from gcar_deploy.predict.kinds import MULTI, PREDICTOR_KINDS
 from tests.cli.conftest import gcar
 
 
@@ -386,7 +386,7 @@ def test_run_with_the_papers_predictor_and_refinement_is_never_ok(good_case, tmp
 
 @pytest.mark.parametrize("kind", ["multi", "paper"])
 def test_info_prints_the_card_of_a_model(kind, tmp_path):
-    path = PREDICTORS[kind].path
+    path = PREDICTOR_KINDS[kind].path
     done = gcar("info", path)
     assert done.code == 0 and f"gcp-{kind}: Gaussian centre predictor" in done.out
     spec = json.loads(path.with_suffix(".json").read_text())

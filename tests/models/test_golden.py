@@ -21,9 +21,9 @@ from gcar_deploy.models.golden import check_golden, golden_path, read_golden
 from gcar_deploy.models.session import Session
 from gcar_deploy.models.spec import read_model
 from gcar_deploy.predict.center_predictor import CenterPredictor
-from gcar_deploy.predict.kinds import MULTI, PREDICTORS, read_predictor
+from gcar_deploy.predict.kinds import MULTI, PREDICTOR_KINDS, read_predictor
 
-KINDS = (*PREDICTORS.values(), SEGMENTER)
+KINDS = (*PREDICTOR_KINDS.values(), SEGMENTER)
 TINY = Path(__file__).parents[1] / "data" / "tiny.onnx"
 
 

@@ -14,7 +14,7 @@ from gcar_deploy.geometry.epipolar import plane_normal
 from gcar_deploy.tree.edit import reversed_branch, with_branch
 from gcar_deploy.tree.tree import empty_tree
 from gcar_deploy.tubes import topology
-from gcar_deploy.tubes.exchange import LEAST_MM, PLANE_MM, exchanges, followed
+from gcar_deploy.tubes.exchange import LEAST_MM, PLANE_MM, followed, trial_exchanges
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import Progress
 from gcar_deploy.tubes.run import Run
@@ -59,7 +59,7 @@ def test_the_stretches_beyond_a_crossing_are_those_of_the_true_vessels(turned):
         branches = tuple(reversed_branch(branch) for branch in wrong.branches)
         wrong = dataclasses.replace(wrong, branches=branches)
     # No ray goes through both vessels elsewhere.
-    found = exchanges(wrong, carms)
+    found = trial_exchanges(wrong, carms)
     away = cKDTree(truth.points())
     gaps = [max(away.query(course)[0].max() for course in one.courses_mm) for one in found]
     best = found[int(np.argmin(gaps))]
@@ -80,10 +80,10 @@ def test_the_stretches_beyond_a_crossing_are_those_of_the_true_vessels(turned):
 def test_vessels_without_a_crossing_have_nothing_to_exchange():
     truth, _, carms = _crossing()
     one = dataclasses.replace(truth, branches=truth.branches[:1])
-    assert exchanges(one, carms) == []
+    assert trial_exchanges(one, carms) == []
     apart = truth.branches[0]
     moved = dataclasses.replace(apart, points_mm=apart.points_mm + np.array([0.0, 0.0, 60.0]))
-    assert exchanges(dataclasses.replace(truth, branches=(apart, moved)), carms) == []
+    assert trial_exchanges(dataclasses.replace(truth, branches=(apart, moved)), carms) == []
 
 
 def _found(start, truth, carms, calibrated):
@@ -112,7 +112,7 @@ def test_what_is_right_stays_to_the_last_bit(monkeypatch):
     truth, _, carms = _crossing()
     start = points_of(truth, grid(100))
     found = _found(start, truth, carms, True)
-    monkeypatch.setattr(topology, "exchanges", lambda *_: [])
+    monkeypatch.setattr(topology, "trial_exchanges", lambda *_: [])
     assert _found(start, truth, carms, True).points().tobytes() == found.points().tobytes()
     monkeypatch.undo()
     # Though every exchange is tried, none is better.
@@ -141,7 +141,7 @@ def test_an_exchange_that_tears_the_tree_apart_is_none(monkeypatch):
 def test_what_says_little_of_mass_has_nothing_exchanged(monkeypatch, calibrated, size):
     """Estimated paths, and pixels of 1.4 mm at the isocentre."""
     truth, wrong, _ = _crossing()
-    monkeypatch.setattr(topology, "exchanges", lambda *_: pytest.fail("asked for"))
+    monkeypatch.setattr(topology, "trial_exchanges", lambda *_: pytest.fail("asked for"))
     start, carms = points_of(wrong, grid(100)), two_views(size, 128 / size)
     assert len(_found(start, truth, carms, calibrated).branches) > 0
 
