@@ -25,6 +25,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.pose.joint import corrected
 from gcar_deploy.pose.motion import DIGITS, Modes, Motion, pixel_size_mm, thinned
 from gcar_deploy.pose.pairwise import Pose
+from gcar_deploy.pose.profile_fit import FREE, pair_theta
 from gcar_deploy.types import Array, Pixels, Scalars
 
 #: an extremum stands out by so much from what it hangs together with, within so far; shorter parts
@@ -53,8 +54,8 @@ RAW_MM, RAW_GAIN = 0.55, 8.0
 LEAST_POINTS, UNDONE, PLACED = 3, (7, 0.8, 5.0), (3, 0.7, 3.0)
 #: vessel pixels that the size of a motion is taken over
 VESSEL_PIXELS = 1000
-#: unknowns of the pose, and their steps for derivatives (mm, deg, deg)
-POSE, _STEP = 3, np.array([0.1, 0.02, 0.02])
+#: steps of a pose's unknowns for derivatives (mm, deg, deg)
+_STEP = np.array([0.1, 0.02, 0.02])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,16 +192,16 @@ def agree_at_frontiers(fixed: VesselImage, moving: VesselImage, theta: Array) ->
     match = _Match.of(
         points[0], points[1], pair, np.argwhere(moving.mask)[:, ::-1].astype(np.float64)
     )
-    rest = match.evidence(np.zeros(POSE + match.field.count))[0]
-    rigid, moved = match.best(POSE), match.best(POSE + match.field.count)
-    motion_mm = match.field.at(carm, match.vessel) @ moved[0][POSE:]
+    rest = match.evidence(np.zeros(FREE + match.field.count))[0]
+    rigid, moved = match.best(FREE), match.best(FREE + match.field.count)
+    motion_mm = match.field.at(carm, match.vessel) @ moved[0][FREE:]
     count = min(len(p.pixels) for p in points)
     return Agreement(
         count=count,
-        theta=theta + _pose(rigid[0], match.normal), gain=rigid[1] - rest,
+        theta=theta + pair_theta(rigid[0], match.normal), gain=rigid[1] - rest,
         matched=float(rigid[2].sum()) / count,
-        moving_theta=theta + _pose(moved[0], match.normal),
-        motion=match.field.motion(moved[0][POSE:], float(motion_mm.std())),
+        moving_theta=theta + pair_theta(moved[0], match.normal),
+        motion=match.field.motion(moved[0][FREE:], float(motion_mm.std())),
         moving_gain=moved[1] - rigid[1], moving_matched=float(moved[2].sum()) / count,
     )  # fmt: skip
 
@@ -272,7 +273,7 @@ class _Match:
 
         here = gaps(carm, second.pixels)
         pose = [
-            (gaps(corrected(carm, _pose(step, normal)), second.pixels) - here) / size
+            (gaps(corrected(carm, pair_theta(step, normal)), second.pixels) - here) / size
             for step, size in zip(np.diag(_STEP), _STEP, strict=True)
         ]
         step_mm = 0.1
@@ -327,11 +328,6 @@ class _Match:
         x = np.round(x, DIGITS)
         value, partner, _ = self.evidence(x)
         return x, value, partner
-
-
-def _pose(x: Scalars, normal: Array) -> Array:
-    """(5,) correction of a view from the unknowns."""
-    return np.concatenate([x[0] * normal, x[1:POSE]])
 
 
 def _bell(x: Array, width: float) -> Array:

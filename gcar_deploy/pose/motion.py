@@ -28,7 +28,7 @@ from gcar_deploy.geometry.prior import ANGLE_DEG, OFFSET_MM
 from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.pose.joint import corrected
-from gcar_deploy.pose.profile_fit import PROFILE_NOISE, SEARCH_MM, STEP_MM
+from gcar_deploy.pose.profile_fit import FREE, PROFILE_NOISE, SEARCH_MM, STEP_MM, pair_theta
 from gcar_deploy.types import Array, Image, Mask, Pixels, Scalars
 
 #: how far a point moves beyond a shift and over what distance alike, standard deviation and
@@ -48,9 +48,6 @@ LEAST_GAIN, MOST_LEFT, MOST_MM = 0.5, 0.04, 2 * MOTION_MM
 NARROWING, MOST_STEPS, TOLERANCE, STEP_SHARE = (1.0, 0.2, 0.1), 15, 1e-3, 1e-2
 #: digits of what is found that the pictures can tell
 DIGITS = 4
-#: unknowns of the pose beside the motion: shift across the planes, two angles. A shift within them
-#: shows in exact profiles of a rigid tree alone
-FREE = 3
 #: inverse of the field by repeated insertion: moves of one pixel in a hundred are done in this many
 _INSERTIONS = 6
 
@@ -216,12 +213,9 @@ def estimate_motion(
     normal = plane_normal(fixed.carm, carm)
     along = field.direction / pixel_size_mm(carm)
 
-    def pose(x: Array) -> Array:
-        return np.concatenate([x[0] * normal, x[1:FREE]])
-
     def moved(x: Array) -> tuple[Mass, CArm]:
         pixels = moving.pixels + (basis @ x[FREE:])[:, None] * along
-        return dataclasses.replace(moving, pixels=pixels), corrected(carm, pose(x))
+        return dataclasses.replace(moving, pixels=pixels), corrected(carm, pair_theta(x, normal))
 
     def residuals(x: Array, sigma_mm: float, noise: float) -> Scalars:
         a, b = mass_profiles(fixed, *moved(x), sigma_mm)
@@ -253,7 +247,7 @@ def estimate_motion(
     rms_mm = float((basis @ x[FREE:]).std())
     if after > min(LEAST_GAIN * before, MOST_LEFT) or rms_mm > MOST_MM or abs(x[0]) > SEARCH_MM:
         return None
-    return pose(x), field.motion(x[FREE:], rms_mm), after
+    return pair_theta(x, normal), field.motion(x[FREE:], rms_mm), after
 
 
 def thinned(points: Array, most: int) -> Array:

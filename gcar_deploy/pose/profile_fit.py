@@ -48,6 +48,9 @@ DIGITS = 4
 TRIAL_SHARE = 0.1
 #: bound of the number of fits; each lowers what is left
 MOST_FITS = 12
+#: what pictures of masks, or of a heart that moved, tell of a pose: shift across the planes, two
+#: angles. A shift within them shows in exact profiles of a rigid tree alone
+FREE = 3
 #: (pose, smoothing in mm, error of a profile) -> residuals in standard deviations
 Residuals = Callable[[Array, float, float], Scalars]
 
@@ -135,6 +138,18 @@ def tolerances(masses: Iterable[Mass]) -> tuple[float, float]:
     """Error of a profile, and share of the disagreement that a correction must come below."""
     mask = any(mass.mask for mass in masses)
     return (MASK_NOISE, MASK_MIN_GAIN) if mask else (PROFILE_NOISE, MIN_GAIN)
+
+
+def pair_theta(x: Array, normal: Array) -> Array:
+    """(5,) correction of a view from its first ``FREE`` unknowns, mm and deg.
+
+    Parameters
+    ----------
+    x : (n,) unknowns; those of a motion may follow
+    normal : (3,) across the epipolar planes (``plane_normal``)
+    """
+    out: Array = np.concatenate([x[0] * normal, x[1:FREE]])
+    return out
 
 
 def prior_sigmas() -> Array:

@@ -101,7 +101,25 @@ def close_calls(tree: Tree, pieces: Pieces) -> tuple[CloseCall, ...]:
 
 def kept_tree(tree: Tree, pieces: Pieces) -> Tree:
     """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
-    return _kept(tree, tubes_of(tree), pieces)
+    tubes = tubes_of(tree)
+    branches: list[Branch] = []
+    nodes = list(tree.nodes_mm)
+    for k, branch in enumerate(tree.branches):
+        own = np.flatnonzero(tubes.branch == k)
+        wanted = pieces.share[pieces.segment[own]] >= MIN_SHARE
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(int), [0]])))
+        for first, stop in edges.reshape(-1, 2):
+            part = part_of(branch, int(first), int(stop))
+            start, end = branch.start, branch.end
+            if first > 0:
+                start = len(nodes)
+                nodes.append(part.points_mm[0])
+            if stop < len(own):
+                end = len(nodes)
+                nodes.append(part.points_mm[-1])
+            branches.append(dataclasses.replace(part, start=start, end=end))
+    cut = Tree(nodes_mm=np.array(nodes), branches=tuple(branches))
+    return kept_branches(cut, np.ones(len(branches), bool))
 
 
 def reinstated(
@@ -271,25 +289,3 @@ def _weighted_median(values: Scalars, weight: Scalars) -> float:
     order = np.argsort(values, kind="stable")
     part = np.cumsum(weight[order])
     return float(values[order][np.searchsorted(part, 0.5 * part[-1])])
-
-
-def _kept(tree: Tree, tubes: Tubes, pieces: Pieces) -> Tree:
-    """Rebuild the tree from the wanted pieces; where a branch is cut, new free ends appear."""
-    branches: list[Branch] = []
-    nodes = list(tree.nodes_mm)
-    for k, branch in enumerate(tree.branches):
-        own = np.flatnonzero(tubes.branch == k)
-        wanted = pieces.share[pieces.segment[own]] >= MIN_SHARE
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], wanted.astype(int), [0]])))
-        for first, stop in edges.reshape(-1, 2):
-            part = part_of(branch, int(first), int(stop))
-            start, end = branch.start, branch.end
-            if first > 0:
-                start = len(nodes)
-                nodes.append(part.points_mm[0])
-            if stop < len(own):
-                end = len(nodes)
-                nodes.append(part.points_mm[-1])
-            branches.append(dataclasses.replace(part, start=start, end=end))
-    cut = Tree(nodes_mm=np.array(nodes), branches=tuple(branches))
-    return kept_branches(cut, np.ones(len(branches), bool))

@@ -228,14 +228,7 @@ def _nearer_to(left: Tree, whole: Tree, gaussians: Gaussians) -> Gaussians:
         return gaussians_on_tree(left)
     kept = cKDTree(left.points()).query(gaussians.means_mm)[0]
     all_ = cKDTree(whole.points()).query(gaussians.means_mm)[0]
-    keep = kept <= all_ + 1e-9
-    return Gaussians(
-        means_mm=gaussians.means_mm[keep],
-        scales_mm=gaussians.scales_mm[keep],
-        quaternions_wxyz=gaussians.quaternions_wxyz[keep],
-        intensity=gaussians.intensity[keep],
-        sigma_mm=None if gaussians.sigma_mm is None else gaussians.sigma_mm[keep],
-    )
+    return gaussians.select(kept <= all_ + 1e-9)
 
 
 def _unrefined(centers: CenterPoints, views: int) -> Refined:
