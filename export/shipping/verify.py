@@ -9,7 +9,7 @@ import numpy as np
 
 from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.imaging.net import Segmenter, open_segmenter
-from gcar_deploy.models import read_model
+from gcar_deploy.models import model_card, read_model
 from gcar_deploy.predict.center_predictor import open_predictor
 from gcar_deploy.predict.kinds import PAPER, PREDICTOR_KINDS
 from gcar_export.scenes.angiograms import training_pair
@@ -30,8 +30,6 @@ def verify_model(path: Path, scenes: int) -> str:
     ModelError
         The file is not what its spec says.
     """
-    from gcar_deploy.cli.model_card import card
-
     model = read_model(path, (*PREDICTOR_KINDS.values(), SEGMENTER))
     license_text(model.name, model.spec, "")
     found: dict[str, list[float]] = {}
@@ -47,7 +45,7 @@ def verify_model(path: Path, scenes: int) -> str:
             named = f"share of lone centres within {REACH_PIXELS:g} pixels"
         for kind, score in scores(model, scenes):
             found.setdefault(kind, []).append(score)
-    lines = card(model)
+    lines = model_card(model)
     worst = session.check_golden()
     lines.append(
         "warning: no golden case beside it: only its form was checked, not that it says what it "

@@ -23,13 +23,12 @@ def info(path: Path, as_json: bool) -> None:
     from gcar_deploy.errors import UsageError
 
     if path.suffix == ".onnx":
-        from gcar_deploy.cli.model_card import card
         from gcar_deploy.imaging.net import KIND as SEGMENTER
-        from gcar_deploy.models import read_model
+        from gcar_deploy.models import model_card, read_model
         from gcar_deploy.predict import PREDICTOR_KINDS
 
         model = read_model(path, (*PREDICTOR_KINDS.values(), SEGMENTER))
-        click.echo(json.dumps(model.spec) if as_json else "\n".join(card(model)))
+        click.echo(json.dumps(model.spec) if as_json else "\n".join(model_card(model)))
         return
     from gcar_deploy.output.stored import read_summary
 

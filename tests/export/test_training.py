@@ -17,8 +17,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from gcar_deploy.cli.model_card import card
 from gcar_deploy.errors import GcarError, ModelError, UsageError
+from gcar_deploy.models.card import model_card
 from gcar_deploy.models.session import Session
 from gcar_deploy.models.spec import read_model, shipped_model_path
 from gcar_deploy.predict.encoding import flat_inputs, input_names
@@ -277,7 +277,7 @@ def test_what_the_first_weights_were_trained_on_stays_said(tmp_path, monkeypatch
     file = types.SimpleNamespace(
         spec=child, name="m", sha256="0", kind="multi", data=b"", inputs={}
     )
-    assert "label volume a 111111111111, of its first weights" in "\n".join(card(file))
+    assert "label volume a 111111111111, of its first weights" in "\n".join(model_card(file))
     # terms that somebody wrote into a card go on as they are
     child["license"] = "CC-BY-NC-4.0"
     second = _generation(tmp_path / "two", child, monkeypatch, {"a": "2" * 64})

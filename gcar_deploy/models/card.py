@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from gcar_deploy.models.spec import ModelFile
 
 
-def card(model: ModelFile) -> list[str]:
+def model_card(model: ModelFile) -> list[str]:
     """Return the card for people, one line a fact."""
     spec = model.spec
     training = spec.get("training", {})
