@@ -52,18 +52,11 @@ def fdk(
     options = options or FdkOptions()
     weights = _undo_gap_weights(carms)
     weighted = [w * picture for w, picture in zip(weights, path_mm, strict=True)]
-    pictures = rtk_geometry.stack(weighted, carms)
-    volume = rtk_geometry.volume_image(None, grid)
-    method = rtk_geometry.rtk().FDKConeBeamReconstructionFilter[type(pictures)].New()
-    method.SetInput(0, volume)
-    method.SetInput(1, pictures)
-    method.SetGeometry(rtk_geometry.geometry(carms))
+    method = rtk_geometry.rtk().FDKConeBeamReconstructionFilter[rtk_geometry.image_type()].New()
     method.GetRampFilter().SetHannCutFrequency(options.hann_cut)
     # Coronary trees lie inside every picture: no truncation correction.
     method.GetRampFilter().SetTruncationCorrection(0.0)
-    method.Update()
-    out: Volume = np.clip(rtk_geometry.volume_array(method.GetOutput()), 0, 1)
-    return out
+    return rtk_geometry.reconstructed(method, weighted, carms, grid)
 
 
 def _undo_gap_weights(carms: Sequence[CArm]) -> Array:

@@ -107,6 +107,25 @@ def volume_array(image: Any) -> Volume:
     return np.ascontiguousarray(np.transpose(turned, (2, 0, 1))[:, ::-1, :], dtype=np.float32)
 
 
+def image_type() -> Any:
+    """Type of the stacks and volumes here, which RTK's filters are made for."""
+    import itk
+
+    return itk.Image[itk.F, 3]
+
+
+def reconstructed(
+    method: Any, path_mm: Sequence[Image], carms: Sequence[CArm], grid: Grid
+) -> Volume:
+    """Run a reconstruction filter on pictures, from an empty volume; occupancy 0 .. 1."""
+    method.SetInput(0, volume_image(None, grid))
+    method.SetInput(1, stack(path_mm, carms))
+    method.SetGeometry(geometry(carms))
+    method.Update()
+    out: Volume = np.clip(volume_array(method.GetOutput()), 0, 1)
+    return out
+
+
 def forward(volume: Volume, grid: Grid, carms: Sequence[CArm]) -> list[Image]:
     """Joseph forward projection: line integrals of (nx, ny, nz), one picture per view, mm."""
     import itk

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import numpy as np
-
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Image, Volume
@@ -51,16 +49,9 @@ def sart(
     (nx, ny, nz) float32, 0 .. 1
     """
     options = options or SartOptions()
-    pictures = rtk_geometry.stack(path_mm, carms)
-    volume = rtk_geometry.volume_image(None, grid)
-    cls = rtk_geometry.rtk().SARTConeBeamReconstructionFilter
-    method = cls[type(volume), type(pictures)].New()
-    method.SetInput(0, volume)
-    method.SetInput(1, pictures)
-    method.SetGeometry(rtk_geometry.geometry(carms))
+    kind = rtk_geometry.image_type()
+    method = rtk_geometry.rtk().SARTConeBeamReconstructionFilter[kind, kind].New()
     method.SetNumberOfIterations(options.iterations)
     method.SetLambda(options.relaxation)
     method.SetEnforcePositivity(True)
-    method.Update()
-    out: Volume = np.clip(rtk_geometry.volume_array(method.GetOutput()), 0, 1)
-    return out
+    return rtk_geometry.reconstructed(method, path_mm, carms, grid)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import click
 import torch
@@ -64,6 +65,11 @@ def learning_rate(options: Schedule, step: int) -> float:
     up = min(1.0, (step + 1) / options.warmup_steps)
     down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
     return options.learning_rate * up * down
+
+
+def precision(device: str, bf16: bool) -> contextlib.AbstractContextManager[Any]:
+    """Within it a forward pass is in bfloat16 where that is wanted."""
+    return torch.autocast(torch.device(device).type, torch.bfloat16, enabled=bf16)
 
 
 @dataclasses.dataclass(frozen=True)

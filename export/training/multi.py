@@ -29,6 +29,7 @@ from gcar_deploy.errors import GcarError, ModelError
 from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training.dataset import TrainingScene, training_scene
 from gcar_export.training.examinations import SceneOptions
+from gcar_export.training.loop import learning_rate, precision
 from gcar_export.training.mean_weights import MeanWeights
 from gcar_export.training.networks.sparse import SparseConfig, SparsePredictor
 from gcar_export.training.run_folder import (
@@ -98,13 +99,6 @@ CONFIGS = {
     "tune": SparseConfig(),
     "tiny": SparseConfig(width=(3, 2, 2, 2), stages=1, ray_width=1),
 }
-
-
-def learning_rate(options: TrainOptions, step: int) -> float:
-    """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
-    up = min(1.0, (step + 1) / options.warmup_steps)
-    down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
-    return options.learning_rate * up * down
 
 
 def inputs(scene: TrainingScene, device: str = "cpu") -> tuple:
@@ -313,7 +307,7 @@ def _replica(rank: int, job: _Job, stop: Flag) -> None:
             scene = next(drawn)
             for group in optimiser.param_groups:
                 group["lr"] = learning_rate(options, step)
-            with _precision(options):
+            with precision(options.device, options.bf16):
                 outputs = forward(*inputs(scene, options.device))
             loss = scene_loss([o.float() for o in outputs], scene)
             optimiser.zero_grad()
@@ -366,11 +360,6 @@ def _run_folder(job: _Job) -> RunFolder:
             "validation_seed": VALIDATION_SEED,
         },
     )
-
-
-def _precision(options: TrainOptions) -> contextlib.AbstractContextManager[Any]:
-    kind = torch.device(options.device).type
-    return torch.autocast(kind, torch.bfloat16, enabled=options.bf16)
 
 
 def _tell(step: int, scores: Mapping[str, Mapping[str, float]]) -> None:

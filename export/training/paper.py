@@ -21,6 +21,7 @@ import torch
 from gcar_deploy.predict.center_map import DEPTH_PIXELS, decode
 from gcar_export.scenes.capsules import LabelTree
 from gcar_export.training import losses
+from gcar_export.training.loop import learning_rate, precision
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.paper_dataset import POSES, VIEWS, TrainingPicture, training_pictures
 from gcar_export.training.run_folder import (
@@ -85,13 +86,6 @@ CONFIGS = {
     "gpu": UNetConfig(width=(16, 32, 64, 96, 128, 160), pose=True),
     "tiny": UNetConfig(pixels=64, alpha=4, width=(4, 4)),
 }
-
-
-def learning_rate(options: PaperTraining, step: int) -> float:
-    """Rate at ``step``: linear warm-up, constant, linear to zero over the last steps."""
-    up = min(1.0, (step + 1) / options.warmup_steps)
-    down = min(1.0, max(0.0, (options.steps - step) / max(options.decay_steps, 1)))
-    return options.learning_rate * up * down
 
 
 @dataclasses.dataclass(eq=False)
@@ -283,7 +277,7 @@ def _train(
         batch = Batch.of(drawn, config.alpha, options.device)
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(options, step)
-        with _precision(options):
+        with precision(options.device, options.bf16):
             picture = batch.pictures.contiguous(memory_format=torch.channels_last)
             answer = forward(picture, batch.axes)
         loss, _ = batch_loss(answer.float(), batch, step, options)
@@ -301,11 +295,6 @@ def _train(
     run.save(net, optimiser, step, {"skipped_steps": skipped})
     if stop.is_set():
         run.interrupt(step)
-
-
-def _precision(options: PaperTraining) -> contextlib.AbstractContextManager[Any]:
-    kind = torch.device(options.device).type
-    return torch.autocast(kind, torch.bfloat16, enabled=options.bf16)
 
 
 def _manifest(

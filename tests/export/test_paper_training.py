@@ -15,6 +15,7 @@ from gcar_export.scenes.capsules import Capsules
 from gcar_export.scenes.render import path_and_depth, path_lengths
 from gcar_export.training import paper
 from gcar_export.training.checkpoint import read_manifest
+from gcar_export.training.loop import learning_rate
 from gcar_export.training.losses import depth_loss, depth_weight, silog
 from gcar_export.training.networks.unet import UNetConfig, UNetPredictor
 from gcar_export.training.paper import (
@@ -23,7 +24,6 @@ from gcar_export.training.paper import (
     Batch,
     PaperTraining,
     batch_loss,
-    learning_rate,
     train,
 )
 from gcar_export.training.paper_dataset import lumen_points, training_pictures

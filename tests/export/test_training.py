@@ -28,12 +28,12 @@ from gcar_export.shipping.tiny_model import TINY
 from gcar_export.training import multi
 from gcar_export.training.dataset import training_scene
 from gcar_export.training.examinations import SceneOptions
+from gcar_export.training.loop import learning_rate
 from gcar_export.training.multi import (
     CONFIGS,
     PRESETS,
     TrainOptions,
     inputs,
-    learning_rate,
     scene_loss,
     train,
 )
