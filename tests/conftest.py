@@ -35,6 +35,18 @@ def chromium():
         found.close()
 
 
+@pytest.fixture(scope="session")
+def result():
+    """One reconstruction of the smallest case, without a model."""
+    from gcar_deploy.config import PredictOptions, RunOptions
+    from gcar_deploy.engine import Engine
+    from gcar_deploy.selftest import tiny_case
+
+    angiograms, grid, _ = tiny_case()
+    options = RunOptions(predict=PredictOptions(predictor="none"))
+    return Engine(options=options).reconstruct(angiograms, grid)
+
+
 def data_dir() -> Path:
     """Folder with the optional large data (environment variable GCAR_DATA), or skip."""
     value = os.environ.get("GCAR_DATA", "")
@@ -44,9 +56,9 @@ def data_dir() -> Path:
 
 
 def of_data(*parts: str) -> Path:
-    """Return a folder of the optional data, wherever ``GCAR_DATA`` begins; skip without it."""
+    """Return part of the optional data, wherever ``GCAR_DATA`` begins; skip without it."""
     for root in (data_dir(), data_dir() / "data", data_dir().parent):
-        if root.joinpath(*parts).is_dir():
+        if root.joinpath(*parts).exists():
             return root.joinpath(*parts)
     pytest.skip("the optional data has no " + "/".join(parts))
 

@@ -8,16 +8,9 @@ from scipy import ndimage
 from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.grid import Grid
 from gcar_export.scenes.labels import LabelVolume, from_array, read_label
-from tests.conftest import data_dir
+from tests.conftest import of_data
 
 nibabel = pytest.importorskip("nibabel")
-
-
-def data(*parts):
-    for base in (data_dir(), data_dir() / "data"):
-        if base.joinpath(*parts).exists():
-            return base.joinpath(*parts)
-    pytest.skip("GCAR_DATA has no " + "/".join(parts))
 
 
 def two_trees():
@@ -205,8 +198,8 @@ def test_cropping_keeps_every_voxel_in_place():
 )
 @pytest.mark.parametrize("protocol", ["P", "C"])
 def test_truth_of_the_ready_cases(case, protocol):
-    label = read_label(data("imagecas", f"{case}.label.nii.gz"))
-    folder = data("cases", f"{protocol}_{case}")
+    label = read_label(of_data("imagecas", f"{case}.label.nii.gz"))
+    folder = of_data("cases", f"{protocol}_{case}")
     volume = json.loads((folder / "geom.json").read_text())["volume"]
     grid = Grid(**{key: tuple(value) for key, value in volume.items()})
     tree = label if protocol == "P" else label.left_right()[0].centred()
@@ -215,7 +208,7 @@ def test_truth_of_the_ready_cases(case, protocol):
 
 
 def test_asoca_case():
-    label = read_label(data("asoca", "normal_1.npz"))
+    label = read_label(of_data("asoca", "normal_1.npz"))
     assert label.occupancy.max() <= 1
     left, right = label.left_right()
     # The left tree lies to the left of, behind and above the right one.

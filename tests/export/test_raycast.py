@@ -9,16 +9,9 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.raw_pictures import raw_picture
 from gcar_export.scenes.raycast import as_label, raycast, silhouette
-from tests.conftest import data_dir
+from tests.conftest import of_data
 
 MOVED_MM, TURNED_DEG = (1.5, -2.0, 3.0), 1.0
-
-
-def data(*parts):
-    for base in (data_dir(), data_dir() / "data"):
-        if base.joinpath(*parts).exists():
-            return base.joinpath(*parts)
-    pytest.skip("GCAR_DATA has no " + "/".join(parts))
 
 
 def carm(primary=30.0, secondary=25.0, size=96, **more):
@@ -122,8 +115,8 @@ def test_empty_and_unseen_volumes_are_dark():
 )
 @pytest.mark.parametrize("protocol", ["P", "C", "M"])
 def test_pictures_of_the_ready_cases(case, protocol):
-    label = read_label(data("imagecas", f"{case}.label.nii.gz"))
-    folder = data("cases", f"{protocol}_{case}")
+    label = read_label(of_data("imagecas", f"{case}.label.nii.gz"))
+    folder = of_data("cases", f"{protocol}_{case}")
     tree = label if protocol == "P" else label.left_right()[0].centred()
     for index, entry in enumerate(json.loads((folder / "geom.json").read_text())["views"]):
         scale = entry.pop("intensity")["mm_per_count"]

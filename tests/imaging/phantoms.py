@@ -11,6 +11,7 @@ import numpy as np
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.types import Mask
 
 #: of the pictures below, at the isocentre
 PIXEL_MM = 0.3
@@ -72,3 +73,7 @@ def png(rows=32, columns=32, depth=8, colour=0, data=None, before=(), interlace=
     parts = [png_chunk(b"IHDR", header), *before]
     parts += [png_chunk(b"IDAT", zlib.compress(data)), png_chunk(b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def dice(a: Mask, b: Mask) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())

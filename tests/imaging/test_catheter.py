@@ -19,7 +19,7 @@ from gcar_deploy.imaging.pictures import vessel_pictures
 from gcar_deploy.imaging.resample import resized
 from gcar_deploy.imaging.shaft import shaft
 from gcar_deploy.imaging.skeleton import skeletonize
-from tests.imaging.phantoms import angiogram, raw_picture
+from tests.imaging.phantoms import angiogram, dice, raw_picture
 
 _SIDE, _MM, _FINE = 240, 0.5, 4
 _OPTIONS = ImagingOptions()
@@ -79,10 +79,6 @@ def _kept(tubes, seed=0):
         return _found(tubes, seed)
 
 
-def _dice(a, b):
-    return 2 * (a & b).sum() / (a.sum() + b.sum())
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", sorted(_CATHETERS))
@@ -96,7 +92,7 @@ def test_a_catheter_goes_and_the_vessels_stay(name, seed):
     assert (found.catheter & own).sum() > 0.8 * own.sum()
     assert not (found.catheter & found.mask).any()
     assert found.catheter_mm == pytest.approx(own.sum() * _MM, rel=0.4)
-    assert _dice(found.mask, clean.mask) > 0.94
+    assert dice(found.mask, clean.mask) > 0.94
 
 
 @pytest.mark.slow
@@ -148,7 +144,7 @@ def test_a_lead_across_the_field_goes():
     with_lead, clean = _found((*tree, lead)), _found(tree)
     own = skeletonize(_tubes([lead]) > 0)
     assert (with_lead.mask & own).sum() < 0.1 * own.sum()
-    assert _dice(with_lead.mask, clean.mask) > 0.9
+    assert dice(with_lead.mask, clean.mask) > 0.9
 
 
 def test_a_catheter_is_seen_before_it_goes():
@@ -185,7 +181,7 @@ def test_turned_and_mirrored_pictures_decide_alike(scene):
             back = back[:, ::-1] if mirrored else back
             assert found.catheter_mm == pytest.approx(upright.catheter_mm, abs=4.0)
             if upright.catheter_mm > 0:
-                assert _dice(back, upright.catheter) > 0.85
+                assert dice(back, upright.catheter) > 0.85
 
 
 def test_it_is_said_and_drawn(caplog, monkeypatch):

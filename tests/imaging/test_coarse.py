@@ -11,14 +11,10 @@ from gcar_deploy.config import ImagingOptions
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.coarse import as_fine, coarser
 from gcar_deploy.imaging.extract import extract_vessels
-from tests.imaging.phantoms import angiogram, carm, raw_picture, tube_paths
+from tests.imaging.phantoms import angiogram, carm, dice, raw_picture, tube_paths
 
 #: of the large pictures, at the isocentre
 FINE_MM = 0.1
-
-
-def _dice(a, b) -> float:
-    return 2 * (a & b).sum() / (a.sum() + b.sum())
 
 
 @pytest.mark.parametrize(
@@ -55,7 +51,7 @@ def test_what_is_found_keeps_area_mass_and_line_on_the_finer_pixels() -> None:
     large = angiogram(true, pixel_mm=FINE_MM)
     found = as_fine(small, large)
     assert found.carm == large.carm and found.valid.all()
-    assert _dice(found.mask, true > 0.2) > 0.97
+    assert dice(found.mask, true > 0.2) > 0.97
     mass = float(path.sum()) * (2 * FINE_MM) ** 2
     assert float(found.path_mm.sum()) * FINE_MM**2 == pytest.approx(mass, rel=2e-3)
     # Nearest pixels would be off by 0.08 mm.
@@ -76,7 +72,7 @@ def test_large_raw_pictures_give_the_vessels_on_their_own_pixels() -> None:
     erased[:300] = True
     found = extract_vessels(picture, ImagingOptions())
     assert found.mask.shape == true.shape and found.carm == picture.carm
-    assert _dice(found.mask, true > 0.3) > 0.9
+    assert dice(found.mask, true > 0.3) > 0.9
     drawn = extract_vessels(dataclasses.replace(picture, erased=erased), ImagingOptions())
     assert not drawn.mask[:300].any()
     np.testing.assert_array_equal(drawn.mask[320:], found.mask[320:])

@@ -14,6 +14,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.even_ground import shadow
 from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.types import Image, Mask
+from tests.imaging.phantoms import dice
 
 SIDE = 400
 NO_HOLES = np.zeros((SIDE, SIDE), bool)
@@ -40,10 +41,6 @@ def drawn(depth: bool) -> tuple[Image, Mask]:
             out = np.maximum(out, chord)
     mask = out > 0
     return (out if depth else mask.astype(float)).astype(np.float32), mask
-
-
-def dice(a: Mask, b: Mask) -> float:
-    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 @pytest.mark.parametrize("depth", [False, True])

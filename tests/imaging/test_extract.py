@@ -17,14 +17,10 @@ from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.resample import area_average, coarsened, coarser_view, resize, resized
 from gcar_deploy.imaging.widths import MASK_ERROR
 from tests.conftest import data_dir
-from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, raw_picture, tube_paths
+from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, dice, raw_picture, tube_paths
 
 _OPTIONS = ImagingOptions()
 _PICTURES = ("path_mm", "mask", "skeleton", "device", "painted", "valid")
-
-
-def _dice(a, b):
-    return 2 * (a & b).sum() / (a.sum() + b.sum())
 
 
 @pytest.mark.req("REQ-12")
@@ -97,7 +93,7 @@ def test_raw_tube_gives_mask_and_path_within_a_stated_tolerance(radius_mm):
     truth = tube_paths(radius_mm=radius_mm)
     found = extract_vessels(angiogram(raw_picture(truth)), _OPTIONS)
     assert not found.calibrated and found.kind == "raw"
-    assert _dice(found.mask, truth > 0.3 * radius_mm) > 0.85
+    assert dice(found.mask, truth > 0.3 * radius_mm) > 0.85
     both = found.mask & (truth > radius_mm)
     assert np.median(found.path_mm[both] / truth[both]) == pytest.approx(1.0, abs=0.15)
     assert np.corrcoef(found.path_mm[both | found.mask], truth[both | found.mask])[0, 1] > 0.85
@@ -112,7 +108,7 @@ def test_polarity_declared_or_seen_gives_the_same_vessels():
     negative = 255 - picture
     for polarity in ("bright", "auto"):
         turned = extract_vessels(angiogram(negative, polarity=polarity), _OPTIONS)
-        assert _dice(turned.mask, dark.mask) > 0.9
+        assert dice(turned.mask, dark.mask) > 0.9
 
 
 def test_a_picture_that_is_hardly_bright_is_what_is_usual_of_its_kind():
@@ -156,8 +152,8 @@ def test_a_negative_with_a_shutter_gives_the_same_vessels():
     dark, turned = (
         extract_vessels(angiogram(one), _OPTIONS).mask for one in (picture, 255 - picture)
     )
-    assert _dice(dark, tube_paths() > 0.5) > 0.8
-    assert _dice(dark, turned) > 0.95
+    assert dice(dark, tube_paths() > 0.5) > 0.8
+    assert dice(dark, turned) > 0.95
 
 
 def test_sixteen_bit_equals_eight_bit_within_quantisation():
@@ -166,7 +162,7 @@ def test_sixteen_bit_equals_eight_bit_within_quantisation():
     eight = np.clip(np.round(light + noise), 0, 255)
     sixteen = np.clip(np.round((light + noise) * 257), 0, 65535)
     a, b = (extract_vessels(angiogram(p), _OPTIONS) for p in (eight, sixteen))
-    assert _dice(a.mask, b.mask) > 0.97
+    assert dice(a.mask, b.mask) > 0.97
     assert b.path_mm.sum() == pytest.approx(a.path_mm.sum(), rel=0.03)
 
 

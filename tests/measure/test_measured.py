@@ -11,19 +11,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gcar_deploy import reconstruction
-from gcar_deploy.config import PredictOptions, RunOptions
-from gcar_deploy.engine import Engine
 from gcar_deploy.measure.lumen import foreshortening
 from gcar_deploy.measure.measured import measured, residuals
-from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import empty_tree
-
-
-@pytest.fixture(scope="module")
-def result():
-    angiograms, grid, _ = tiny_case()
-    options = RunOptions(predict=PredictOptions(predictor="none"))
-    return Engine(options=options).reconstruct(angiograms, grid)
 
 
 def test_everything_is_measured_once_for_all_files_and_doors(result, tmp_path, monkeypatch):

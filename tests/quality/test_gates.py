@@ -6,10 +6,9 @@ import dataclasses
 
 import pytest
 
-from gcar_deploy.config import ImagingOptions, QualityOptions
+from gcar_deploy.config import QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.quality.gates import (
     best_separation,
     check_candidates,
@@ -21,16 +20,9 @@ from gcar_deploy.quality.gates import (
     kind_of,
     with_hint,
 )
-from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import empty_tree
 
 OPTIONS = QualityOptions()
-
-
-@pytest.fixture(scope="module")
-def case():
-    angiograms, _, tree = tiny_case()
-    return angiograms, [extract_vessels(a, ImagingOptions()) for a in angiograms], tree
 
 
 def turned(angiogram, primary):

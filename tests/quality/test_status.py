@@ -18,17 +18,10 @@ from gcar_deploy.quality.status import (
     part_lengths_mm,
     view_quality,
 )
-from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.hard.phantoms import both, paths, straight
 
 OPTIONS = QualityOptions()
-
-
-@pytest.fixture(scope="module")
-def case():
-    angiograms, _, tree = tiny_case()
-    return angiograms, [extract_vessels(a, ImagingOptions()) for a in angiograms], tree
 
 
 def test_the_true_tree_is_ok_and_covers_everything(case):

@@ -5,26 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import pytest
 
-from gcar_deploy.config import PredictOptions, RunOptions
-from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.epipolar import plane_angles
 from gcar_deploy.inputs.order import Order, parse_order
 from gcar_deploy.quality.alternatives import Exchange
-from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tubes import CloseCall
 from gcar_deploy.workbench.alternatives import alternatives, exchange_marks
 from tests.output.made_results import with_ghost
 
 BASE = {"views": ["a", "b"]}
-
-
-@pytest.fixture(scope="module")
-def result():
-    angiograms, grid, _ = tiny_case()
-    options = RunOptions(predict=PredictOptions(predictor="none"))
-    return Engine(options=options).reconstruct(angiograms, grid)
 
 
 def nearest_branch(result, place):
