@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import graphlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -171,6 +172,16 @@ def test_no_arrow_up():
         assert own[0] != "gcar_deploy" or other[0] != "gcar_export", f"{name} imports {module}"
         if other in FLOORS and other[0] == own[0] and other != own:
             assert FLOORS[other] < FLOORS[own], f"{name} imports {module}"
+
+
+def test_the_drawing_and_the_table_of_the_rooms_name_them_all():
+    """CONTRIBUTING draws the floors from the top down; the table has the rooms of several files."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    lines = re.search(r"^    gcar_deploy\n((?:      .+\n)+)", text, re.MULTILINE)[1].splitlines()
+    drawn = [set(line.split()) for line in reversed(lines)]
+    assert drawn == [set(rooms.split()) for rooms in RUNTIME_FLOORS]
+    told = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
+    assert told == {file.parent.name for file in PACKAGE.glob("*/__init__.py")}
 
 
 def test_nothing_imports_tests():
