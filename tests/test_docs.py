@@ -76,6 +76,17 @@ def test_pictures_are_small():
     assert max(sizes.values()) < 200_000 and sum(sizes.values()) < 1_000_000
 
 
+def test_the_host_guide_names_every_argument_of_a_call():
+    import inspect
+
+    from gcar_deploy.engine import Engine
+
+    page = (DOCS / "host-guide.md").read_text(encoding="utf-8")
+    table = page[page.index("| argument | meaning |") :].split("\n\n")[0]
+    said = re.findall(r"^\| `(\w+)", table, re.MULTILINE)
+    assert said == list(inspect.signature(Engine.reconstruct).parameters)[1:]
+
+
 @pytest.mark.slow
 def test_the_python_host_runs_as_printed(good_case, tmp_path, monkeypatch, capsys):  # noqa: F811
     code = re.findall(

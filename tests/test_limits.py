@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,16 @@ TEXT = (Path(__file__).parents[1] / "docs" / "limits.md").read_text(encoding="ut
 def test_every_limit_is_in_the_table(limits):
     for field in dataclasses.fields(limits):
         assert field.name in TEXT, f"docs/limits.md: {limits.__name__}.{field.name}"
+
+
+@pytest.mark.req("REQ-49")
+def test_every_limit_of_the_table_can_be_changed():
+    known = {limits.__name__: limits for limits in (PictureLimits, DicomLimits, ModelLimits)}
+    named = re.findall(r"`(\w+Limits)\.(\w+)`((?:, `\w+`)*)", TEXT)
+    assert len(named) > 5
+    for limits, first, more in named:
+        for name in (first, *re.findall(r"\w+", more)):
+            assert name in known[limits].__dataclass_fields__, f"docs/limits.md: {limits}.{name}"
 
 
 @pytest.mark.req("REQ-49")
