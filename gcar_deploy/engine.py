@@ -140,7 +140,7 @@ class Engine:
         cancel : callable, for instance ``threading.Event().is_set``; asked, as is the deadline,
             before each frame that is read, each stage, estimate of the pose and step of the
             refinement, and from another thread while the model runs
-        on_step : told what each stage hands on, for instance ``output.steps.StepFolder``
+        on_step : told what each stage hands on, for instance ``output.step_folder.StepFolder``
 
         Raises
         ------

@@ -14,9 +14,9 @@ import numpy as np
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm, separation_deg
-from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import silent_errors
+from gcar_deploy.geometry.own_frame import own_frame
 from gcar_deploy.geometry.scene import Scene
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.extract import asked_network, asks_network, extract_vessels

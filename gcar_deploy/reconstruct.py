@@ -14,8 +14,8 @@ import numpy as np
 from gcar_deploy.beside import started
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import RefusedError, UsageError
-from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.own_frame import own_frame
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.net import Segmenter
 from gcar_deploy.imaging.own_frame import in_own_frame

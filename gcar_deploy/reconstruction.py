@@ -17,13 +17,13 @@ from gcar_deploy.config import RunOptions
 from gcar_deploy.flow import PressureDrop, doubts_of, pressure_drop, pressure_table
 from gcar_deploy.gaussians.gaussians import Gaussians
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.frame import OwnFrame
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.observability import (
     EXACT_DISAGREEMENT,
     depth_and_plane,
     silent_errors,
 )
+from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.resample import resized
 from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-from gcar_deploy.geometry.frame import OwnFrame
+from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.vessels import Vessels
 from gcar_deploy.pose import Registered
 from gcar_deploy.predict import Centers, Seen

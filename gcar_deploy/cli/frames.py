@@ -13,7 +13,7 @@ from gcar_deploy.cli.request import order_options
 from gcar_deploy.inputs.order import Order
 
 if TYPE_CHECKING:
-    from gcar_deploy.imaging.frame import FramePair
+    from gcar_deploy.imaging.chosen_frame import FramePair
 
 #: pairs in the table
 _BEST = 8

@@ -96,8 +96,8 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
         from gcar_deploy.worker.listen import LOOPBACK, Listener, tell
         from gcar_deploy.worker.send import parse_peer, sent_back
     from gcar_deploy.worker.jobs import Job, JobQueue
+    from gcar_deploy.worker.order_folders import sweep_scratch
     from gcar_deploy.worker.orders import do_order
-    from gcar_deploy.worker.scratch import sweep_scratch
 
     peer = None if service.send_to is None else parse_peer(service.send_to)
     try:

@@ -71,7 +71,7 @@ def run(
 
 def _step_folder(folder: Path, out: Path) -> OnStep:
     from gcar_deploy.errors import UsageError
-    from gcar_deploy.output.steps import StepFolder
+    from gcar_deploy.output.step_folder import StepFolder
 
     if out.resolve() in (folder.resolve(), *folder.resolve().parents):
         raise UsageError(f"--keep-steps {folder} lies in --out; name a folder beside it")

@@ -114,8 +114,8 @@ def serve(door: Door, limits: Limits, order: Order, engine: EngineChoice, talk: 
             import gcar_deploy.worker.http  # noqa: F401
     from gcar_deploy.worker.folder import AllowedFolder
     from gcar_deploy.worker.jobs import JobQueue
+    from gcar_deploy.worker.order_folders import drop_all_scratch, sweep_scratch
     from gcar_deploy.worker.orders import do_order
-    from gcar_deploy.worker.scratch import drop_all_scratch, sweep_scratch
 
     allowed = None if door.folder is None else AllowedFolder(door.folder)
     # Only what will serve changes its process: a refused call leaves it as it was.

@@ -19,7 +19,7 @@ from gcar_deploy.dicom.shutter import open_field
 from gcar_deploy.errors import GeometryError, RefusedError, UsageError
 from gcar_deploy.geometry.scene import Intensity, Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.imaging.frame import ChosenFrame
+from gcar_deploy.imaging.chosen_frame import ChosenFrame
 from gcar_deploy.types import Image, Mask
 
 _log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from gcar_deploy.frames.masses import RunMasses, reduced, run_masses
 from gcar_deploy.frames.pairs import choose_pair
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
-from gcar_deploy.imaging.frame import ChosenFrame, FramePair
+from gcar_deploy.imaging.chosen_frame import ChosenFrame, FramePair
 from gcar_deploy.types import Image
 
 #: runs of fewer frames show no heartbeat

@@ -15,7 +15,7 @@ import numpy as np
 
 from gcar_deploy.frames.masses import RunMasses, plane_profiles
 from gcar_deploy.geometry.consistency import BIN_MM
-from gcar_deploy.imaging.frame import FramePair
+from gcar_deploy.imaging.chosen_frame import FramePair
 from gcar_deploy.types import Array, Mask, Scalars
 
 #: frames filled to this share, and the stiller part of them, are taken

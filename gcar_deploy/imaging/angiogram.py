@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from gcar_deploy.errors import ImageError
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.imaging.frame import ChosenFrame
+from gcar_deploy.imaging.chosen_frame import ChosenFrame
 from gcar_deploy.types import Image, Mask
 
 if TYPE_CHECKING:  # only a name in annotations: pictures need no scene file

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from gcar_deploy.config import Landmark, RunOptions
-from gcar_deploy.geometry.frame import OwnFrame
+from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.square import square_point, squared
 

@@ -19,8 +19,8 @@ from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity, Scene, match_picture
 from gcar_deploy.imaging.angiogram import Angiogram
+from gcar_deploy.imaging.chosen_frame import ChosenFrame, FramePair
 from gcar_deploy.imaging.extract import asks_network
-from gcar_deploy.imaging.frame import ChosenFrame, FramePair
 from gcar_deploy.types import Image
 
 #: told the share done, 0 .. 1

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.imaging.angiogram import Angiogram
-from gcar_deploy.imaging.frame import FramePair
+from gcar_deploy.imaging.chosen_frame import FramePair
 from gcar_deploy.output.overlay import grey8, png_bytes
 from gcar_deploy.types import Array, Image
 

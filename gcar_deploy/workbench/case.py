@@ -22,10 +22,10 @@ from gcar_deploy.errors import GcarError, GeometryError, UsageError
 from gcar_deploy.files import read_text
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.fields import read_json
-from gcar_deploy.geometry.frame import OwnFrame
+from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.geometry.scene import Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.frame import ChosenFrame
+from gcar_deploy.imaging.chosen_frame import ChosenFrame
 from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.vessels import Vessels

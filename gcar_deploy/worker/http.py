@@ -21,8 +21,8 @@ from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
 from gcar_deploy.worker.loopback import THREADS, error, guard, tell_errors
+from gcar_deploy.worker.order_folders import drop_scratch, new_scratch
 from gcar_deploy.worker.orders import Received, placed, receive, scratch_file
-from gcar_deploy.worker.scratch import drop_scratch, new_scratch
 
 #: answered without a token: nothing in them is anybody's
 _OPEN = ("/health", "/openapi.json")

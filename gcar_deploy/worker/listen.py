@@ -22,8 +22,8 @@ from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.geometry.fields import MOST_VIEWS
 from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.jobs import Job, JobQueue
+from gcar_deploy.worker.order_folders import drop_scratch, new_scratch
 from gcar_deploy.worker.orders import Received
-from gcar_deploy.worker.scratch import drop_scratch, new_scratch
 
 _log = logging.getLogger(__name__)
 LOOPBACK = "127.0.0.1"

@@ -11,7 +11,7 @@ from typing import Any
 from gcar_deploy.engine import Engine, check_target_of, deliver
 from gcar_deploy.inputs.order import Order, parse_order
 from gcar_deploy.worker.folder import AllowedFolder
-from gcar_deploy.worker.scratch import drop_scratch, new_scratch
+from gcar_deploy.worker.order_folders import drop_scratch, new_scratch
 
 _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,8}")
 

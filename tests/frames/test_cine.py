@@ -17,7 +17,7 @@ from gcar_deploy.dicom.choose import choose_frame
 from gcar_deploy.errors import ImageError, UsageError
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
-from gcar_deploy.imaging.frame import ChosenFrame, FramePair
+from gcar_deploy.imaging.chosen_frame import ChosenFrame, FramePair
 from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.inputs.runs import find_runs
 from gcar_deploy.quality import check_views

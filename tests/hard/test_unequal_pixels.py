@@ -9,7 +9,7 @@ import pytest
 
 from gcar_deploy.config import RunOptions
 from gcar_deploy.engine import Engine
-from gcar_deploy.geometry.frame import own_frame
+from gcar_deploy.geometry.own_frame import own_frame
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.own_frame import in_own_frame
 from gcar_deploy.imaging.square import square_point, square_shape, squared

@@ -17,8 +17,8 @@ import pytest
 from gcar_deploy.errors import NumericalError
 from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.jobs import JobQueue, QueueFullError
+from gcar_deploy.worker.order_folders import drop_scratch, new_scratch, sweep_scratch
 from gcar_deploy.worker.orders import Received, suffix_of
-from gcar_deploy.worker.scratch import drop_scratch, new_scratch, sweep_scratch
 
 
 def an_order(scratch=None, **fields):
@@ -110,7 +110,7 @@ def test_old_jobs_are_forgotten_with_their_files(queue):
 def test_pictures_of_a_killed_worker_are_removed_by_the_next(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     code = (
-        "import time; from gcar_deploy.worker.scratch import new_scratch\n"
+        "import time; from gcar_deploy.worker.order_folders import new_scratch\n"
         "folder = new_scratch(); (folder / 'view1.png').write_bytes(b'1')\n"
         "print(folder, flush=True); time.sleep(600)"
     )

@@ -26,7 +26,7 @@ from typing import TypeAlias
 import numpy as np
 
 from gcar_deploy.errors import GcarError
-from gcar_deploy.geometry.frame import OwnFrame
+from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.vessels import Vessels
 from gcar_deploy.output.folder import check_target

@@ -15,7 +15,7 @@ from gcar_deploy.config import PredictOptions, QualityOptions, RunOptions
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError, UsageError
-from gcar_deploy.output.steps import PATH_COUNT_MM, StepFolder
+from gcar_deploy.output.step_folder import PATH_COUNT_MM, StepFolder
 from gcar_deploy.selftest import tiny_case
 
 OPTIONS = RunOptions(predict=PredictOptions(predictor="none"))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.frame import own_frame
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.own_frame import own_frame
 
 
 def view(primary: float, secondary: float, **other: object) -> CArm:
