@@ -133,6 +133,9 @@ def fit_level(
         taken += 1
         tubes, prints, loss = trial, trial_prints, value
         targets = rescaled(targets, prints)
+        if not all(target.calibrated for target in targets):
+            # The next step has to beat the objective under the contrast it is judged by.
+            loss = objective(tubes, targets, prints, prior, options)
         progress.steps += 1
         progress.losses.append(loss)
         if gain < TOLERANCE:
