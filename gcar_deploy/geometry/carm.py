@@ -92,12 +92,13 @@ class CArm:
         Added to each world point before projecting: the patient moved by that much.
     projection_matrix : 3x4 nested tuple or None
         LPS mm to pixels. Replaces the angles when it is given with ``from_matrix``;
-        beside angles it must agree within 0.5 px.
+        beside angles it must agree within 0.5 px, and be one that can be read off.
 
     Raises
     ------
     GeometryError
-        A value is not finite, out of range, or SDD does not exceed SOD.
+        A value is not finite, out of range, or SDD does not exceed SOD; the matrix has skewed
+        pixels, or is at odds with the rest.
     """
 
     primary_angle_deg: float
@@ -154,6 +155,8 @@ class CArm:
                 f"projection_matrix disagrees with the angles and distances by {gap:.2f} px "
                 f"(limit {MATRIX_TOLERANCE_PX} px within 30 mm of the isocentre)"
             )
+        # What a run will ask of it is refused here, before any work.
+        self.by_angles()
 
     @classmethod
     def from_matrix(cls, matrix: Any, *, rows: int, columns: int) -> CArm:
@@ -169,19 +172,30 @@ class CArm:
         return dataclasses.replace(view, projection_matrix=tuple(map(tuple, P.tolist())))
 
     @classmethod
-    def from_reading(cls, told: ReadOff, sdd_mm: float, *, rows: int, columns: int) -> CArm:
-        """Build a view from what a matrix says of it, and from where its detector stands."""
+    def from_reading(
+        cls, told: ReadOff, sdd_mm: float, *, rows: int, columns: int, sod_mm: float | None = None
+    ) -> CArm:
+        """Build a view from what a matrix says of it, and from where its detector stands.
+
+        ``sod_mm`` says where the isocentre is, which a matrix does not: the rest of the depth of
+        the world's origin is an offset. Without it the isocentre is as deep as the origin.
+        """
+        offset = told.offset_mm
+        if sod_mm is not None:
+            beam = axes(told.primary_deg, told.secondary_deg, 0.0)[2]
+            x, y, z = (offset + (told.sod_mm - sod_mm) * beam).tolist()
+            offset = x, y, z
         return cls(
             primary_angle_deg=told.primary_deg,
             secondary_angle_deg=told.secondary_deg,
             detector_rotation_deg=told.rotation_deg,
-            sod_mm=told.sod_mm,
+            sod_mm=told.sod_mm if sod_mm is None else sod_mm,
             sdd_mm=sdd_mm,
             rows=rows,
             columns=columns,
             pixel_spacing_mm=(sdd_mm / told.focal_px[1], sdd_mm / told.focal_px[0]),
             principal_point_px=told.principal_point_px,
-            isocenter_offset_mm=told.offset_mm,
+            isocenter_offset_mm=offset,
         )
 
     # -- matrices -------------------------------------------------------------------------
@@ -327,32 +341,42 @@ class CArm:
             self, isocenter_offset_mm=tuple(total.tolist()), projection_matrix=matrix
         )
 
+    def by_angles(self) -> CArm:
+        """Return the view without a matrix: where it has one, what that says but for its skew."""
+        if self.projection_matrix is None:
+            return self
+        return CArm.from_reading(
+            read_off(self.world2pixel), self.sdd_mm,
+            rows=self.rows, columns=self.columns, sod_mm=self.sod_mm,
+        )  # fmt: skip
+
     def turned(
         self,
         primary_deg: float = 0.0,
         secondary_deg: float = 0.0,
         offset_mm: Any = (0.0, 0.0, 0.0),
     ) -> CArm:
-        """Return the same view with angles changed by so many degrees (matrix dropped).
+        """Return the same view with angles changed by so many degrees, without a matrix.
 
+        It starts from ``by_angles``: angles told beside a matrix may be half a pixel off it.
         ``offset_mm`` (3,) moves the patient as well, as ``moved`` does.
 
         Beyond the poles and the back the same direction is named within the allowed ranges:
         (a, b, g) = (a + 180, 180 - b, g + 180).
         """
-        primary = self.primary_angle_deg + primary_deg
-        secondary = self.secondary_angle_deg + secondary_deg
-        rotation = self.detector_rotation_deg
+        told = self.by_angles()
+        primary = told.primary_angle_deg + primary_deg
+        secondary = told.secondary_angle_deg + secondary_deg
+        rotation = told.detector_rotation_deg
         if abs(secondary) > 90.0:
             primary, secondary = primary + 180.0, math.copysign(180.0, secondary) - secondary
             rotation += 180.0 if rotation <= 0 else -180.0
         return dataclasses.replace(
-            self,
+            told,
             primary_angle_deg=primary if abs(primary) <= 180.0 else (primary + 180) % 360 - 180,
             secondary_angle_deg=secondary,
             detector_rotation_deg=rotation,
-            isocenter_offset_mm=tuple(np.add(self.isocenter_offset_mm, offset_mm).tolist()),
-            projection_matrix=None,
+            isocenter_offset_mm=tuple(np.add(told.isocenter_offset_mm, offset_mm).tolist()),
         )
 
     def clinical_name(self) -> str:

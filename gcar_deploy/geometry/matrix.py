@@ -15,8 +15,9 @@ import numpy as np
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.types import Array, Pixels, Points, Scalars
 
-#: rows of the picture's axes may be so far from a right angle (cosine)
-_SKEW = 1e-6
+#: the picture's axes may be so far from a right angle (cosine): half a pixel over 500, and far more
+#: than what matrices written to five digits have
+_SKEW = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

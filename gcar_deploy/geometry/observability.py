@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.matrix import read_off
 from gcar_deploy.types import Array, Points, Scalars
 
 #: singular values below this share of the largest count as zero
@@ -236,6 +237,8 @@ def silent_errors(carms: Sequence[CArm], *, exact: bool = False) -> tuple[str, .
     sentences, each with the error in the geometry, its effect in mm, and that it leaves no trace
     """
     points = 50.0 / math.sqrt(3.0) * np.array(list(itertools.product((-1, 1), repeat=3)))
+    # Errors are of angles and distances: what a matrix has beyond these stays out of the figures.
+    carms = [carm.by_angles() for carm in carms]
     apart = [separation_deg(a, b) for a, b in itertools.combinations(carms, 2)]
     angle = max((min(s, 180 - s) for s in apart), default=0.0)
     out = []
@@ -267,7 +270,6 @@ def _usual_errors(carms: Sequence[CArm]) -> list[tuple[str, list[CArm]]]:
                 dataclasses.replace(
                     c,
                     pixel_spacing_mm=(pitch * c.pixel_spacing_mm[0], pitch * c.pixel_spacing_mm[1]),
-                    projection_matrix=None,
                 )
                 for c in carms
             ],
@@ -291,10 +293,11 @@ def _swung(carms: Sequence[CArm], angle_deg: float) -> CArm:
     """Return the last view turned about the isocentre within the plane of the first and last."""
     normal = np.cross(_in_plane(carms), carms[-1].axes[2])
     x, y, z = math.radians(angle_deg) * normal
-    P = carms[-1].world2pixel
+    last, P = carms[-1], carms[-1].world2pixel
     turn = expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
-    return CArm.from_matrix(
-        np.column_stack([P[:, :3] @ turn, P[:, 3]]), rows=carms[-1].rows, columns=carms[-1].columns
+    told = read_off(np.column_stack([P[:, :3] @ turn, P[:, 3]]))
+    return CArm.from_reading(
+        told, last.sdd_mm, rows=last.rows, columns=last.columns, sod_mm=last.sod_mm
     )
 
 

@@ -59,8 +59,7 @@ class OwnFrame:
             sdd = min(max(SDD_OVER_SOD * told.sod_mm, least), most)
             return CArm.from_reading(told, sdd, rows=own.rows, columns=own.columns)
         except GeometryError:
-            # Beside angles a matrix may be a little skewed, which they do not say; or the view is
-            # at the very end of a range.
+            # The view is at the very end of a range.
             return own
 
     def grid(self, grid: Grid) -> Grid:

@@ -212,6 +212,19 @@ def test_matrix_beside_angles_must_agree():
         dataclasses.replace(carm, projection_matrix=carm.turned(1.0).world2pixel.tolist())
 
 
+def test_turning_starts_where_the_matrix_stands():
+    """Angles told beside it may be half a pixel off."""
+    carm = CArm(
+        primary_angle_deg=30, secondary_angle_deg=25, isocenter_offset_mm=(3, 9, -20), **BASE
+    )
+    true = carm.turned(0.02)
+    told = dataclasses.replace(carm, projection_matrix=true.world2pixel.tolist())
+    np.testing.assert_allclose(told.turned().project(CORNERS)[0], true.project(CORNERS)[0])
+    ahead, other = told.turned(2.0, -1.0, (1.0, 2.0, 3.0)), true.turned(2.0, -1.0, (1.0, 2.0, 3.0))
+    np.testing.assert_allclose(ahead.project(CORNERS)[0], other.project(CORNERS)[0])
+    assert told.by_angles().projection_matrix is None and carm.by_angles() is carm
+
+
 def test_separation_and_names():
     a = CArm(primary_angle_deg=-30, secondary_angle_deg=-20, **BASE)
     b = CArm(primary_angle_deg=45, secondary_angle_deg=25, **BASE)
