@@ -42,6 +42,8 @@ class Frames:
                 self._dataset = pydicom.dcmread(BytesIO(header.data))
                 self._decoder: Any = get_decoder(self._dataset.file_meta.TransferSyntaxUID)
                 size = len(self._dataset.PixelData)
+        except MemoryError:
+            raise
         except Exception:  # noqa: BLE001 - pydicom's errors share no base class
             raise ImageError(f"{header.name}: has no readable pixels; export it again") from None
         self._packed = bool(self._decoder.is_encapsulated)
@@ -86,7 +88,7 @@ class Frames:
                     self._dataset, index=index, raw=True, correct_unused_bits=False
                 )
             pixels = np.asarray(pixels).astype(np.int64)
-        except ImageError:
+        except (ImageError, MemoryError):
             raise
         except Exception:  # noqa: BLE001 - pydicom's errors share no base class
             raise ImageError(

@@ -85,6 +85,8 @@ class Header:
                         if element.VR == "SQ" and element.value and keyword in element.value[0]:
                             return _filled(element.value[0][keyword].value)
                 return _filled(self.dataset.get(keyword))
+        except MemoryError:
+            raise
         except Exception:  # noqa: BLE001 - pydicom's errors share no base class
             raise GeometryError(f"{self.name}: {tag(keyword)} cannot be read") from None
 
@@ -215,6 +217,8 @@ def _header(name: str, data: bytes, limits: DicomLimits) -> Header:
             high = dataset.get("HighBit")
             high = stored - 1 if high is None else int(high)
             grey = str(dataset.get("PhotometricInterpretation")).strip().upper()
+    except MemoryError:
+        raise
     except Exception:  # noqa: BLE001 - pydicom's errors share no base class
         raise ValueError("has a damaged header; export it again") from None
     if stream.tell() >= len(data) and (kind == "nothing" or ENHANCED.startswith(kind)):

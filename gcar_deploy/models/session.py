@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.errors import CancelledError, ModelError, NumericalError
+from gcar_deploy.errors import CancelledError, ModelError, NumericalError, out_of_memory
 from gcar_deploy.models.golden import check_golden
 from gcar_deploy.models.spec import ModelFile
 from gcar_deploy.types import Array
@@ -147,9 +147,11 @@ class Session:
         runtime = self._runtime
         try:
             found: list[Array] = runtime.run(outputs, dict(feed), options)
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+        except Exception as error:
             if getattr(options, "terminate", False):
                 raise CancelledError("cancelled while the model ran") from None
+            if out_of_memory(error):
+                raise  # no fault of the model's
             raise ModelError(f"model {self.model.name} fails: {_first_line(error)}") from None
         return found
 
@@ -168,7 +170,9 @@ def _open(
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         opened = ort.InferenceSession(model.data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+    except Exception as error:
+        if out_of_memory(error):
+            raise
         raise ModelError(f"model {model.name} does not load: {_first_line(error)}") from None
     found = [node.name for node in opened.get_inputs()]
     if sorted(found) != sorted(inputs) or not opened.get_outputs():

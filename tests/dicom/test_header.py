@@ -40,6 +40,22 @@ def test_pixels_come_out_as_they_went_in(tmp_path):
         np.testing.assert_array_equal(run.decode(k), frames[k])
 
 
+def test_memory_that_runs_out_is_no_damage(tmp_path, monkeypatch):
+    def full(*args, **kwargs):
+        raise MemoryError
+
+    path = save(classic(vessel_frames(1)), tmp_path / "a.dcm")
+    header = read_header(path)
+    run = Frames(header)
+    monkeypatch.setattr(run._decoder, "as_array", full)
+    monkeypatch.setattr(header.dataset, "get", full)
+    monkeypatch.setattr(pydicom, "dcmread", full)
+    for work in (lambda: read_header(path), lambda: header.find("Rows"), lambda: Frames(header),
+                 lambda: run.decode(0)):  # fmt: skip
+        with pytest.raises(MemoryError):
+            work()
+
+
 def test_jpeg_lossless(tmp_path):
     frames = vessel_frames(3, 1)
     plain = save(classic(frames), tmp_path / "a.dcm")

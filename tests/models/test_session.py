@@ -167,6 +167,27 @@ def test_answers_are_held_to_shape_and_to_finite_numbers():
             session(bad).run({}, [(2, 5)])
 
 
+def test_memory_that_runs_out_is_no_fault_of_the_model(monkeypatch):
+    class Full:
+        def __init__(self, *args, **kwargs):
+            pass
+
+        def run(self, *args):
+            raise RuntimeError("Failed to allocate memory for requested buffer of size 9")
+
+    full = session()
+    full._given = Full()
+    with pytest.raises(RuntimeError, match="Failed to allocate"):
+        full.run({}, [(1, 5)])
+
+    def opened(*args, **kwargs):
+        raise MemoryError("bad allocation")
+
+    monkeypatch.setattr(session_module.ort, "InferenceSession", opened)
+    with pytest.raises(MemoryError):
+        Session(dataclasses.replace(read_predictor(TINY), golden=None), input_names())
+
+
 def test_inputs_are_the_graphs_own():
     with pytest.raises(ModelError, match="has other inputs than this version gives"):
         Session(read_predictor(TINY), ["picture"])
