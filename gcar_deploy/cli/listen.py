@@ -111,9 +111,11 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
     said = tell(lambda line: click.echo(line))
 
     def on_change(job: Job) -> None:
-        said(job)
-        if service.once and not job.open:
-            over.set()
+        try:
+            said(job)
+        finally:
+            if service.once and not job.open:
+                over.set()
 
     def work(order: Any, on_progress: Any, cancel: Any) -> Any:
         summary, folder = do_order(warm, order, on_progress, cancel, limit_s=service.limit)

@@ -78,7 +78,8 @@ class JobQueue:
     work : does one order; see ``Work``
     most_waiting : jobs that may wait
     most_kept : finished jobs that are remembered, the oldest forgotten first
-    on_change : called with a job after each of its changes, from the working thread
+    on_change : called with a job after each of its changes, from the working thread; what it
+        raises is logged
     """
 
     def __init__(
@@ -224,5 +225,10 @@ class JobQueue:
             self.forget(other)
 
     def _tell(self, job: Job) -> None:
-        if self._on_change is not None:
+        if self._on_change is None:
+            return
+        try:
             self._on_change(job)
+        except Exception as error:  # noqa: BLE001 - who looks on must not end the only worker
+            _log.error("a change of a job could not be told: %s", type(error).__name__)
+            _log.debug("a change of a job could not be told", exc_info=True)

@@ -94,6 +94,21 @@ def test_memory_that_ran_out_is_called_so_whichever_library_wants_it():
     )
 
 
+def test_who_cannot_be_told_of_a_job_does_not_end_the_worker():
+    def work(order, on_progress, cancel):
+        on_progress("vessels", 0.1)
+        return {}, Path("folder")
+
+    def gone(job):
+        raise BrokenPipeError
+
+    queue = JobQueue(work, on_change=gone)
+    jobs = [queue.submit(an_order()) for _ in range(2)]
+    assert all(job.finished.wait(30) for job in jobs)
+    queue.close()
+    assert [job.state for job in jobs] == ["done", "done"]
+
+
 def test_old_jobs_are_forgotten_with_their_files(queue):
     jobs = []
     for _ in range(5):
