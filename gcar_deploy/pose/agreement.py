@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from gcar_deploy.pose.partners import GAIN, partnered, shown_share
 from gcar_deploy.quality import Remark, check_order, disagreement_limits, kind_of
 
 _log = logging.getLogger(__name__)
+#: poses of readings of the views, after a look whether there is still time
+Estimate: TypeAlias = Callable[[Sequence[VesselImage]], tuple[Pose, ...]]
 
 #: readings of two views, of those that agree best as they stand, whose correction is estimated
 READINGS = 4
@@ -71,7 +74,8 @@ def agreeing(
     seen, poses = views, first
     for readings in (_by_method, _likeliest):
         tried = seen
-        seen, poses = _closest(tried, poses, readings(views, first, options), options)
+        seen, poses = _closest(tried, poses, readings(views, first, options), options,
+                               estimate)  # fmt: skip
         if seen is tried and readings is _likeliest:
             break
         fewer, closer = partnered(
@@ -81,12 +85,12 @@ def agreeing(
         if worst_of(closer) <= limits.good_disagreement_raw:
             return fewer, closer, _changed(fewer, seen)
     # What still contradicts is another tree: it is not trimmed to fit.
-    return _by_width(views, asked, options) or (list(seen), poses, [])
+    return _by_width(views, asked, options, estimate) or (list(seen), poses, [])
 
 
 def _with_widths(
     views: Sequence[VesselImage], asked: Sequence[bool], poses: tuple[Pose, ...],
-    estimate: Callable[[Sequence[VesselImage]], tuple[Pose, ...]],
+    estimate: Estimate,
 ) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:  # fmt: skip
     """Let widths have a word about the paths of raw pictures where the views agree far better so.
 
@@ -121,16 +125,18 @@ def _changed(now: Sequence[VesselImage], views: Sequence[VesselImage]) -> list[s
 
 
 def _by_width(
-    views: Sequence[VesselImage], asked: Sequence[bool], options: RunOptions
+    views: Sequence[VesselImage], asked: Sequence[bool], options: RunOptions, estimate: Estimate
 ) -> tuple[list[VesselImage], tuple[Pose, ...], list[str]] | None:
     """Take depth from widths where contrasts contradict each other; None where widths do too.
 
     Contrast fails where a display cuts off the darkest grey values, and in front of what is as
     dark as a vessel; the outlines may be right all the same.
     """
+    if not any(asked):
+        return None
     drawn = [by_width(view) if may else view for view, may in zip(views, asked, strict=True)]
-    poses = poses_between(drawn, options)
-    if not any(asked) or worst_of(poses) > options.quality.good_disagreement_mask:
+    poses = estimate(drawn)
+    if worst_of(poses) > options.quality.good_disagreement_mask:
         return None
     ids = " and ".join(view.view_id for view, may in zip(views, asked, strict=True) if may)
     said = f"view {ids}: contrasts contradict each other; depth is taken from the widths of vessels"
@@ -139,7 +145,7 @@ def _by_width(
 
 def _closest(
     views: Sequence[VesselImage], poses: tuple[Pose, ...],
-    readings: Sequence[Sequence[VesselImage]], options: RunOptions,
+    readings: Sequence[Sequence[VesselImage]], options: RunOptions, estimate: Estimate,
 ) -> tuple[Sequence[VesselImage], tuple[Pose, ...]]:  # fmt: skip
     """Take the first reading that agrees far better than all before it, if any.
 
@@ -150,7 +156,7 @@ def _closest(
         return views, poses
     whole = views
     for read in readings:
-        closer = poses_between(read, options)
+        closer = estimate(read)
         after, kept = worst_of(closer), shown_share(read, whole)
         if limits.alone_ratio * after < kept * worst:
             _log.info("the views agree better by what one method sees of them, or without rims")

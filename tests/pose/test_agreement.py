@@ -282,6 +282,22 @@ def test_who_wants_out_gets_out_between_two_estimates():
     assert len(asked) == 2
 
 
+def test_who_wants_out_is_asked_before_every_estimate(monkeypatch):
+    """Of readings of one method, and of widths, as well."""
+    angiograms, views = by_contrast((2.0, -2.0))
+    views = [dataclasses.replace(view, others=(view,)) for view in views]
+    asked, made = [], []
+    estimate = agreement.estimate_poses
+
+    def counted(*args):
+        made.append(len(asked))
+        return estimate(*args)
+
+    monkeypatch.setattr(agreement, "estimate_poses", counted)
+    assert "widths" in agreeing(angiograms, views, OPTIONS, lambda: asked.append(0))[2][0]
+    assert made == list(range(1, len(asked) + 1))
+
+
 @pytest.mark.parametrize(("share", "taken"), [(GAIN - 0.01, True), (GAIN + 0.01, False)])
 def test_widths_have_a_word_where_the_views_agree_far_better_so(share, taken):
     """What the network drew, and how well the views are said to agree with other paths."""
