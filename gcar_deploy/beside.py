@@ -43,6 +43,17 @@ def started(work: Callable[[], T]) -> Callable[[], T]:
     return waiting.result
 
 
+@contextlib.contextmanager
+def waited_for(outcome: Callable[[], T]) -> Iterator[Callable[[], T]]:
+    """Let what was ``started`` end before an error of the block does: nobody will ask for it."""
+    try:
+        yield outcome
+    except BaseException:
+        with contextlib.suppress(Exception):
+            outcome()
+        raise
+
+
 def side_by_side(works: Sequence[Callable[[], T]]) -> list[T]:
     """Do independent works on as many threads as are allowed; outcomes in their order."""
     count = min(_ALLOWED.get(), len(works))

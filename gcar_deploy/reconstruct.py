@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gcar_deploy.beside import started
+from gcar_deploy.beside import started, waited_for
 from gcar_deploy.config import RunOptions, check_options
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.geometry.grid import Grid
@@ -145,23 +145,24 @@ def _reconstructed(
             raise RefusedError("every branch was deleted: nothing is left")
         check_tree(refined.tree, options.quality)
     # Nothing but the result asks for the voxels: they are made beside what follows.
-    made = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
-    with watch.stage("quality", keep_if_late=True), placed.hinting():
-        findings += [*placed.findings, *centers.findings]
-        findings += map(Part, (*vessels.findings, *refined.findings))
-        ostia = marked_places(options.ostia, [view.carm for view in placed.views])
-        idle = idle_ostia(refined.tree, ostia)
-        findings += map(Remark, missed + idle)
-        tree = from_inlets(refined.tree, ostia)
-        judged = judge(
-            tree, placed.views, findings, options,
-            disagreement=placed.disagreement, evidence=centers.evidence,
-        )  # fmt: skip
-    with watch.stage("diameters", keep_if_late=True):
-        sections = measure_sections(tree, signals)
-        tree = with_diameters(tree, sections)
-    with watch.stage("tree", keep_if_late=True):
-        volume = made()
+    voxels = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
+    with waited_for(voxels) as made:
+        with watch.stage("quality", keep_if_late=True), placed.hinting():
+            findings += [*placed.findings, *centers.findings]
+            findings += map(Part, (*vessels.findings, *refined.findings))
+            ostia = marked_places(options.ostia, [view.carm for view in placed.views])
+            idle = idle_ostia(refined.tree, ostia)
+            findings += map(Remark, missed + idle)
+            tree = from_inlets(refined.tree, ostia)
+            judged = judge(
+                tree, placed.views, findings, options,
+                disagreement=placed.disagreement, evidence=centers.evidence,
+            )  # fmt: skip
+        with watch.stage("diameters", keep_if_late=True):
+            sections = measure_sections(tree, signals)
+            tree = with_diameters(tree, sections)
+        with watch.stage("tree", keep_if_late=True):
+            volume = made()
     return Reconstruction(
         quality=judged, tree=tree, sections=sections, gaussians=refined.gaussians,
         volume=volume, grid=grid,

@@ -1,13 +1,17 @@
 """Work beside other work: allowed only where asked for, and with the same outcome."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
 
+from gcar_deploy import reconstruct as composition
 from gcar_deploy.beside import allowed_threads, side_by_side, started
+from gcar_deploy.config import PredictOptions, RunOptions
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
+from gcar_deploy.selftest import tiny_case
 from gcar_export.studies.hard_raw import raw_pair
 
 
@@ -51,6 +55,24 @@ def test_what_a_work_raises_comes_through(count):
             side_by_side([int, fails])
         with pytest.raises(ValueError, match="no"):
             started(fails)()
+
+
+def test_no_work_goes_on_after_a_reconstruction_that_failed(monkeypatch):
+    events = []
+
+    def voxels(*args):
+        time.sleep(0.3)
+        events.append("voxels")
+
+    def judged(*args, **kwargs):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(composition, "refined_volume", voxels)
+    monkeypatch.setattr(composition, "judge", judged)
+    options = RunOptions(predict=PredictOptions(predictor="none"))
+    with pytest.raises(ZeroDivisionError):
+        Engine(options=options, threads=2).reconstruct(*tiny_case()[:2])
+    assert events == ["voxels"]
 
 
 @pytest.mark.slow
