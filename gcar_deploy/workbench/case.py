@@ -253,13 +253,14 @@ class Case:
         order = self.ready_order
         # Only what tells how the pictures are read: drawing must not read them again.
         what = json.dumps({k: v for k, v in order.to_dict().items() if k in _READING})
-        if self._read is None or self._read[0] != what:
+        read = self._read  # other threads may set it at any time
+        if read is None or read[0] != what:
             found, _, notes = prepare(
                 order.views, order.geometry, order.options(RunOptions()), order.masks
             )
-            self._read = what, (tuple(found), notes)
+            self._read = read = what, (tuple(found), notes)
             self._keep_pairs(found)
-        return self._read[1]
+        return read[1]
 
     def _keep_pairs(self, angiograms: Sequence[Angiogram]) -> None:
         """Remember how the frames of two runs go together, also when one is then chosen by hand."""
@@ -338,7 +339,17 @@ def _check_geometry(told: Mapping[str, Any]) -> None:
         raise UsageError(str(error)) from None
 
 
-@functools.lru_cache(maxsize=8)
 def _frames(path: Path) -> Cine | None:
+    """Frames of a run as its file is now; None of a file with one frame."""
+    try:
+        told = path.stat()
+    except OSError:
+        return _opened(path, 0, 0)  # says what is wrong with it
+    return _opened(path, told.st_mtime_ns, told.st_size)
+
+
+@functools.lru_cache(maxsize=8)
+def _opened(path: Path, changed_ns: int, size: int) -> Cine | None:
+    # One for each state of the file: another may be put in its place.
     # Frames are only looked at here: a run of the case says whether numbers below 0 are noise.
     return open_cine(path, RunOptions(), subtracted=True)

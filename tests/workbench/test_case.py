@@ -1,0 +1,44 @@
+"""A case on the desk: its pictures are those of its files and its order as they are now."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import cv2
+import numpy as np
+import pytest
+
+from gcar_deploy.errors import GcarError
+from gcar_deploy.workbench.desk import Desk
+
+
+@pytest.fixture
+def desk(tmp_path):
+    return Desk(tmp_path / "cases")
+
+
+def test_a_run_that_was_replaced_is_read_anew(desk, tmp_path):
+    path = tmp_path / "run.tif"
+    case = desk.demo()
+    case.order = dataclasses.replace(case.order, views=(path, path))
+    for second, (count, grey) in enumerate(((3, 9), (3, 77), (5, 77))):
+        pages = [np.full((32, 32), grey, np.uint8) + k for k in range(count)]
+        new = tmp_path / "new.tif"
+        cv2.imwritemulti(str(new), pages)
+        os.utime(new, (second, second))  # clocks of files may be coarse
+        new.replace(path)
+        assert len(case.run_of(1)) == count and case.bare(1)[0, 0] == grey + count // 2
+    path.unlink()
+    with pytest.raises(GcarError):
+        case.run_of(1)
+
+
+def test_a_request_gets_its_own_pictures_whatever_others_read_meanwhile(desk, monkeypatch):
+    case = desk.demo()
+
+    def other(found):
+        case._read = "another order", ((), ["of another order"])
+
+    monkeypatch.setattr(case, "_keep_pairs", other)
+    assert len(case.angiograms()) == 2
