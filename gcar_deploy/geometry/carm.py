@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from functools import cached_property
 from typing import Any
 
@@ -48,14 +49,17 @@ MATRIX_TOLERANCE_PX = 0.5
 SDD_OVER_SOD = 1.5
 
 
-def _check_range(key: str, value: float, unit_suffix: str = "") -> None:
+def _in_range(key: str, value: Any, unit_suffix: str = "") -> float:
+    """Return a number as Python's own, whoever's it was."""
     low, high, unit = HARD_RANGES[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise GeometryError(f"{key}{unit_suffix} must be a number, got {value!r}")
-    if not math.isfinite(value) or not low <= value <= high:
+    number = value if isinstance(value, (int, float)) else float(value)
+    if not math.isfinite(number) or not low <= number <= high:
         raise GeometryError(
-            f"{key}{unit_suffix} = {value:g} {unit} is outside {low:g} .. {high:g} {unit}"
+            f"{key}{unit_suffix} = {number:g} {unit} is outside {low:g} .. {high:g} {unit}"
         )
+    return number
 
 
 def _vector(key: str, value: Any, length: int) -> tuple[float, ...]:
@@ -114,10 +118,9 @@ class CArm:
     projection_matrix: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
-        for key in ("primary_angle_deg", "secondary_angle_deg", "detector_rotation_deg"):
-            _check_range(key, getattr(self, key))
-        for key in ("sod_mm", "sdd_mm", "rows", "columns"):
-            _check_range(key, getattr(self, key))
+        for key in HARD_RANGES:
+            if key != "pixel_spacing_mm":
+                object.__setattr__(self, key, _in_range(key, getattr(self, key)))
         for key in ("rows", "columns"):
             if int(getattr(self, key)) != getattr(self, key):
                 raise GeometryError(f"{key} = {getattr(self, key)!r} must be a whole number")
@@ -131,7 +134,7 @@ class CArm:
             self, "pixel_spacing_mm", _vector("pixel_spacing_mm", self.pixel_spacing_mm, 2)
         )
         for i, name in enumerate((" (row)", " (column)")):
-            _check_range("pixel_spacing_mm", self.pixel_spacing_mm[i], name)
+            _in_range("pixel_spacing_mm", self.pixel_spacing_mm[i], name)
         object.__setattr__(
             self, "isocenter_offset_mm", _vector("isocenter_offset_mm", self.isocenter_offset_mm, 3)
         )

@@ -4,14 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
+from typing import Any
 
 import numpy as np
 
 from gcar_deploy.errors import GeometryError
+from gcar_deploy.geometry.fields import quote
 from gcar_deploy.types import Array, Points
 
 #: voxels of a grid
 MOST_VOXELS = 2**28
+
+
+def _check(key: str, values: Any, low: int, high: int, unit: str) -> None:
+    """Refuse all but 3 numbers within the range, which holds no NaN."""
+    try:
+        told = tuple(values)
+    except TypeError:
+        told = ()
+    fine = (isinstance(x, numbers.Real) and not isinstance(x, bool) for x in told)
+    if len(told) != 3 or not all(fine):
+        raise GeometryError(
+            f"volume.{key} = {quote(values)} must be 3 numbers of {low} .. {high} {unit}"
+        )
+    if not all(low <= x <= high for x in told):
+        raise GeometryError(f"volume.{key} = {values!r} is outside {low} .. {high} {unit}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,6 +43,11 @@ class Grid:
     shape : (3,) number of voxels along x, y, z
     bounds : whether vessels are looked for in it alone; otherwise beside it too, where all views
         show lines that nothing in it explains
+
+    Raises
+    ------
+    GeometryError
+        A value is no number or out of range, or there are more than 2^28 voxels.
     """
 
     center_mm: tuple[float, float, float]
@@ -33,14 +56,11 @@ class Grid:
     bounds: bool = True
 
     def __post_init__(self) -> None:
-        if any(not math.isfinite(c) or abs(c) > 2000 for c in self.center_mm):
-            raise GeometryError(
-                f"volume.center_mm = {self.center_mm!r} is outside -2000 .. 2000 mm"
-            )
-        if any(not math.isfinite(s) or not 1 <= s <= 2000 for s in self.size_mm):
-            raise GeometryError(f"volume.size_mm = {self.size_mm!r} is outside 1 .. 2000 mm")
-        if any(int(n) != n or not 1 <= n <= 1024 for n in self.shape):
-            raise GeometryError(f"volume.shape = {self.shape!r} is outside 1 .. 1024 voxels")
+        _check("center_mm", self.center_mm, -2000, 2000, "mm")
+        _check("size_mm", self.size_mm, 1, 2000, "mm")
+        _check("shape", self.shape, 1, 1024, "voxels")
+        if any(int(n) != n for n in self.shape):
+            raise GeometryError(f"volume.shape = {self.shape!r} must be 3 whole numbers")
         if math.prod(self.shape) > MOST_VOXELS:
             raise GeometryError(f"volume.shape = {self.shape!r} has more than 2^28 voxels")
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,11 @@ class Intensity:
     polarity : ``auto``, ``dark`` or ``bright`` (how vessels look)
     mm_per_count : float or None
         mm of vessel along the ray per count; needed for ``path_length`` alone.
+
+    Raises
+    ------
+    GeometryError
+        A value is none of these, or ``mm_per_count`` outside 1e-9 .. 1000 mm.
     """
 
     kind: str
@@ -73,8 +79,8 @@ class Intensity:
         check_choice("intensity.kind", self.kind, KINDS)
         check_choice("intensity.polarity", self.polarity, POLARITIES)
         scale = self.mm_per_count
-        if scale is not None and not (math.isfinite(scale) and 1e-9 <= scale <= 1e3):
-            raise GeometryError(f"intensity.mm_per_count = {scale!r} is outside 1e-9 .. 1000 mm")
+        if scale is not None:
+            _check_scale(scale)
         if self.kind == "path_length" and scale is None:
             raise GeometryError("intensity.mm_per_count is missing: kind path_length needs it")
 
@@ -82,6 +88,14 @@ class Intensity:
     def subtracted(self) -> bool:
         """Whether the picture is what vessels add to another, whose noise lies about 0."""
         return self.kind in ("path_length", "attenuation")
+
+
+def _check_scale(scale: Any) -> None:
+    named = f"intensity.mm_per_count = {quote(scale)}"
+    if isinstance(scale, bool) or not isinstance(scale, Real):
+        raise GeometryError(f"{named} must be a number of 1e-9 .. 1000 mm")
+    if not 1e-9 <= float(scale) <= 1e3:
+        raise GeometryError(f"{named} is outside 1e-9 .. 1000 mm")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -225,6 +225,17 @@ def test_turning_starts_where_the_matrix_stands():
     assert told.by_angles().projection_matrix is None and carm.by_angles() is carm
 
 
+def test_numbers_of_other_libraries_are_numbers():
+    plain = CArm(primary_angle_deg=30, secondary_angle_deg=25.5, **BASE)
+    told = {"rows": np.int64(480), "columns": np.float32(512), "sod_mm": np.float32(765)}
+    other = CArm(primary_angle_deg=np.int8(30), secondary_angle_deg=np.float16(25.5),
+                 **{**BASE, **told})  # fmt: skip
+    assert other == plain and repr(other.columns) == "512" and repr(other.sod_mm) == "765.0"
+    for bad in (True, np.True_, "480", None):
+        with pytest.raises(GeometryError, match="rows must be a number, got"):
+            CArm(primary_angle_deg=30, secondary_angle_deg=25, **{**BASE, "rows": bad})
+
+
 def test_separation_and_names():
     a = CArm(primary_angle_deg=-30, secondary_angle_deg=-20, **BASE)
     b = CArm(primary_angle_deg=45, secondary_angle_deg=25, **BASE)

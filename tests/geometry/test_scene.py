@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.carm import CArm
+from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import (
     Intensity,
     load_scene,
@@ -211,6 +212,36 @@ def matrix_view(**more):
 def test_nothing_beside_a_lone_matrix_is_ignored(more):
     with pytest.raises(GeometryError, match="at odds with a lone projection_matrix"):
         parse_scene(json.dumps(matrix_view(**more)[1]))
+
+
+CUBE = {"center_mm": (0, 0, 0), "size_mm": (64, 64, 64), "shape": (32, 32, 32)}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("shape", (32, float("nan"), 32), "is outside 1 .. 1024 voxels"),
+        ("shape", (32, float("inf"), 32), "is outside 1 .. 1024 voxels"),
+        ("shape", (32, 32.5, 32), "must be 3 whole numbers"),
+        ("shape", (32, 32), "must be 3 numbers of 1 .. 1024 voxels"),
+        ("shape", 32, "must be 3 numbers of 1 .. 1024 voxels"),
+        ("size_mm", ("64", 64, 64), "must be 3 numbers of 1 .. 2000 mm"),
+        ("center_mm", (0, 0, float("nan")), "is outside -2000 .. 2000 mm"),
+        ("center_mm", (0, 0, True), "must be 3 numbers of -2000 .. 2000 mm"),
+    ],
+)
+def test_a_grid_of_no_numbers_names_its_key_and_its_range(key, value, words):
+    with pytest.raises(GeometryError) as caught:
+        Grid(**{**CUBE, key: value})
+    assert str(caught.value) == f"volume.{key} = {value!r} {words}"
+
+
+@pytest.mark.parametrize(("value", "words"), [("a", "must be a number of"), (True, "must be a"),
+                                              (float("nan"), "is out"), (0, "is out")])  # fmt: skip
+def test_a_scale_that_is_none_is_named_with_its_range(value, words):
+    with pytest.raises(GeometryError, match=r"\.mm_per_count = .*1e-9 \.\. 1000 mm") as caught:
+        Intensity(kind="raw", mm_per_count=value)
+    assert f"{value!r} {words}" in str(caught.value)
 
 
 def test_pixel_spacing_beside_a_lone_matrix_tells_the_detector():
