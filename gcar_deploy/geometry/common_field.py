@@ -26,7 +26,7 @@ def common_field(grid: Grid, carms: Sequence[CArm]) -> Grid:
 
     Returns
     -------
-    Grid with voxels of the same size, about
+    Grid with as many voxels: lattices are laid by its place and size alone
     """
     if grid.bounds:
         return grid
@@ -39,11 +39,8 @@ def common_field(grid: Grid, carms: Sequence[CArm]) -> Grid:
         return grid
     low = np.minimum(corners.min(axis=0), grid.lower_mm)
     high = np.maximum(corners.max(axis=0), grid.lower_mm + grid.size_mm)
-    x, y, z = np.ceil((high - low) / grid.spacing_mm).astype(int).clip(1, 512).tolist()
     center, size = 0.5 * (low + high), high - low
-    return dataclasses.replace(
-        grid, center_mm=tuple(center.tolist()), size_mm=tuple(size.tolist()), shape=(x, y, z)
-    )
+    return dataclasses.replace(grid, center_mm=tuple(center.tolist()), size_mm=tuple(size.tolist()))
 
 
 def _sides(carm: CArm) -> tuple[Points, Scalars]:

@@ -23,8 +23,8 @@ BORDER_SHARE = 0.9
 END_RADII = 1.5
 #: the lumen at an end is the widest within this, mm
 END_MM = 3.0
-#: a branch needs this many points left to state a stenosis.
-MIN_POINTS = 5
+#: a branch needs this many sections left to state a stenosis.
+MIN_SECTIONS = 5
 #: directions at a bifurcation are taken this far from it, mm, at least.
 ANGLE_REACH_MM = 4.0
 
@@ -127,7 +127,7 @@ def _lumen(
         searched = (own.arc_mm >= marked[0]) & (own.arc_mm <= marked[1])
         clear = clear | searched
     healthy = np.full(len(arc_mm), np.nan)
-    if np.count_nonzero(clear) < MIN_POINTS:
+    if np.count_nonzero(clear) < MIN_SECTIONS:
         return BranchLumen(healthy_mm=healthy, sections=own, clear=clear, reference_mm=line)
     low, high = own.arc_mm[clear][[0, -1]]
     inner = (arc_mm >= low) & (arc_mm <= high)

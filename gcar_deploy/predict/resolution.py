@@ -23,7 +23,7 @@ from gcar_deploy.types import Array, Scalars
 THIN_SHARE = 0.15
 #: cells are so many times the thin vessels' radius wide. Chosen on three generated thin trees
 #: (91 .. 93 of ``gcar_export.evaluate.thin_protocol``, none of the protocol's own)
-CELLS_PER_RADIUS = 1.4
+CELL_RADII = 1.4
 #: a point is kept from this share of the thin vessels' own path on
 PATH_SHARE = 0.5
 #: paths are summed over so wide a square, mm; steps along a line are so long on average, pixels
@@ -77,7 +77,7 @@ def resolution(
         return Resolution(own, own, usual)
     thin = _thin_radius_mm(views)
     pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
-    cell = float(np.clip(CELLS_PER_RADIUS * thin, min(max(least, pixel), own), own))
+    cell = float(np.clip(CELL_RADII * thin, min(max(least, pixel), own), own))
     path = PATH_SHARE * np.pi * (thin / cell) ** 2
     low = min(_least(spec, "path_cells", usual), usual)
     return Resolution(cell, own, float(np.clip(path, low, usual)))

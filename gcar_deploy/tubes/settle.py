@@ -23,6 +23,12 @@ from gcar_deploy.types import Array, Image, Points, Scalars
 #: first guess of the scatter and how far cells may be from a point, lattice cells.
 FIRST_SIGMA = 1.0
 REACH = 4.5
+#: cells are taken so many along each axis from a point: the corners of that box are ``REACH``
+#: away (that over the root of 3, rounded up)
+CELLS_ABOUT = 3
+#: a cell is left out where a view shows less path on it on average, mm: the thinnest tube of the
+#: fit is 0.4 mm wide
+LEAST_PATH_MM = 0.35
 #: occupancy below which a settled cell is dropped.
 DROP_BELOW = 0.02
 ITERATIONS = 12
@@ -77,14 +83,13 @@ def settled(
 
 
 def _cells_near(centers: CenterPoints, h: float) -> Points:
-    """Lattice cells within REACH of any point."""
+    """Lattice cells up to ``CELLS_ABOUT`` along each axis from any point."""
     index = np.unique(np.rint(centers.points_mm / h).astype(np.int64), axis=0)
-    r = int(np.ceil(REACH * 0.6))
-    low = index.min(axis=0) - r
-    shape = index.max(axis=0) + r + 1 - low
+    low = index.min(axis=0) - CELLS_ABOUT
+    shape = index.max(axis=0) + CELLS_ABOUT + 1 - low
     mask = np.zeros(shape, bool)
     mask[tuple((index - low).T)] = True
-    mask = ndimage.binary_dilation(mask, np.ones((3, 3, 3)), iterations=r)
+    mask = ndimage.binary_dilation(mask, np.ones((3, 3, 3)), iterations=CELLS_ABOUT)
     return (np.argwhere(mask) + low) * h
 
 
@@ -94,7 +99,7 @@ def _seen_by_all(seen: list[CellView], count: int) -> Array:
         path = view.path_mm.reshape(-1)[view.pixel]
         norm = np.asarray(view.matrix.sum(axis=0)).ravel()
         mean = (view.matrix.T @ path) / np.maximum(norm, 1e-9)
-        keep &= mean > 0.35
+        keep &= mean > LEAST_PATH_MM
     return keep
 
 
