@@ -75,6 +75,8 @@ def reconstruct(
 
     Raises
     ------
+    UsageError
+        Fewer than two pictures, an option out of its range, or a mark that lies in no picture.
     RefusedError
         No tree can honestly be made of these views.
     NumericalError

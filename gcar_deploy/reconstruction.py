@@ -65,7 +65,7 @@ class Reconstruction:
     poses : correction of each view; one of them, by the scene's own order, stays as it was told
     seconds : wall-clock seconds per stage, and ``total``
     counts : whole numbers worth knowing (candidates, Gaussians, steps ...)
-    losses : objective after every accepted refinement step
+    losses : as ``Refined`` has them: the objective at each start and after each accepted step
     predictor, refiner : what was used
     model : name and SHA-256 of the centre predictor, None without one
     segmenter : the same of the network that found vessels, None where none did

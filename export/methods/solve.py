@@ -1,6 +1,6 @@
 """The rows of the tables: each method from a simulated case to a volume.
 
-What a row is, and its settings, stand in ``method_settings``. Everything but the baselines
+What a row is, and its settings, stand in ``settings``. Everything but the baselines
 goes through the runtime's own ``Engine``, exactly as a host program would use it.
 """
 

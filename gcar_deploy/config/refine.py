@@ -100,7 +100,7 @@ RELEASED = dataclasses.replace(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RefineOptions:
-    """The Gaussian refinement."""
+    """How the points become vessels: which refiner does it, and what each may."""
 
     refiner: RefinerName = "tube"
     tube: TubeOptions = dataclasses.field(default_factory=TubeOptions)

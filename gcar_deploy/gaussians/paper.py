@@ -68,7 +68,7 @@ def initial_gaussians(centers: CenterPoints, options: PaperOptions) -> Gaussians
 
     Points closer than ``thin_cells`` to a more confident one join the nearest that stays. Each
     Gaussian takes the mass (confidence times spacing^3 of each), the centre and the spread of
-    its points, to which a single point's own ``initial_sigma_cells`` is added.
+    its points, to which a single point's own ``INITIAL_SIGMA_CELLS`` are added.
     """
     # Centres of single views are all used: none was judged against another.
     least = 0.0 if centers.source == "paper" else options.least_confidence

@@ -39,10 +39,10 @@ CONTRAST_ERROR, CHORD_ERROR = 0.25, 0.15
 #: A vessel of diameter D gives (pi/4) D^2 / p, so D >= 0.36 p is kept; less drowns in the sampling
 #: of the picture itself
 PATH_THRESHOLD_PIXELS = 0.1
-#: less skeleton than this, or a weaker peak in noise deviations, is no vessel; the network tells
-#: faint vessels from noise by their shape
-#: on an even ground nothing but vessel stands out, however small the pixel is said to be
+#: less skeleton than this is no vessel; on an even ground nothing but vessel stands out, however
+#: small the pixel is said to be
 MIN_LENGTH_MM, EVEN_LENGTH_MM = 25.0, 10.0
+#: nor is a weaker peak, in noise deviations; the network tells faint vessels from noise by shape
 MIN_CONTRAST, NET_MIN_CONTRAST = 6.0, 3.0
 #: and the peak, as a share of the white level, must be seen at all
 MIN_PEAK = 0.03

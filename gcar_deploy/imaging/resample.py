@@ -1,4 +1,4 @@
-"""A vessel image at another picture size."""
+"""Pictures, vessel images and their C-arms at other pixel sizes."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ def nearest(values: Array, skeleton: Mask) -> Array:
 
 
 def _carried(values: Array, skeleton: Mask, label: Array) -> Array:
-    """(rows, cols) value at the nearest skeleton pixel; ``label`` as ``_to_line`` numbers them."""
+    """(rows, cols) value at the nearest skeleton pixel; ``label`` as ``to_line`` numbers them."""
     table = np.zeros(int(label.max()) + 1, values.dtype)
     table[label[skeleton]] = values[skeleton]
     return table[label]

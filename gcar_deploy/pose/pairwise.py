@@ -162,7 +162,7 @@ def estimate_poses(
     Each view is compared with that of those already placed whose direction is nearest to 90 deg
     from its own. Nearly opposite views cannot be compared: the line through both sources runs
     through the picture, and planes about it cut no slices. Three and more views are then fitted
-    together (``joint_pose``), which sees what each pair alone cannot.
+    together (``joint``), which sees what each pair alone cannot.
 
     Parameters
     ----------

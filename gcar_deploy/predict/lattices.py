@@ -77,7 +77,8 @@ def mean_evidence(
     Returns
     -------
     CenterPoints
-        ``first`` with the mean confidence; what is no candidate of a number counts 0 there.
+        ``first`` with the mean confidence; what is no candidate of a number counts 0 there. Of a
+        number without any candidate the predictor cannot be asked: ``find_centers`` leaves it out.
     """
     confidence = first.confidence.copy()
     for candidates, told in others:

@@ -96,7 +96,7 @@ class Quality:
     sentence : str
     findings : every reason for ``degraded``, the gravest first
     separation_deg : best angle between two views, folded to 0 .. 90
-    disagreement : worst epipolar disagreement of any view with the first, or None
+    disagreement : worst epipolar disagreement of any view with its partner (``worst_of``), or None
     views : one ViewQuality per view
     exchanges : vessels that the pictures would let change partners
     ghosts : what is known of ghosts in the tree; None where nothing is

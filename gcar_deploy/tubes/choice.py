@@ -37,7 +37,9 @@ PART_MM = 8.0
 #: cost of a mm of piece per confidence below ``FAIR_CONFIDENCE``, units of the objective
 PIECE_COST = 20.0
 FAIR_CONFIDENCE = 0.4
-#: a piece is never dropped whose confidence is at least this share of the kept ones' median
+#: a piece is wanted whatever the pictures say whose confidence is at least this share of the kept
+#: ones' median; where paths are estimates, a part that hangs on no other must still be worth
+#: ``PART_MM``
 TRUSTED_SHARE = 0.8
 #: a piece standing alone is at most so many times as thick as the starting points say
 PIECE_GROWTH = 2.5

@@ -3,7 +3,7 @@
 Unknowns: the position of every centreline point and the log of its radius. Objective:
 
     sum over pixels of rho((path - contrast * model) / sigma) * area     (Cauchy, IRLS)
-    + bending + taper + distance from the start                          (tube_prior)
+    + bending + taper + distance from the start                          (prior)
 
 Points couple along the branch only, apart from shared bifurcations, so the normal equations are
 banded and one step costs what the vessels' length costs. Rays through several vessels weigh each
@@ -67,7 +67,8 @@ class Progress:
     Attributes
     ----------
     losses : list of float
-        Objective after each accepted step; a new level starts a new scale.
+        Objective where each fit starts and after each accepted step; a new level starts a new
+        scale.
     steps, rejected : int
     stopped : bool
         The caller asked to stop (deadline or cancel).

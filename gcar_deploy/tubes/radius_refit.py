@@ -1,9 +1,9 @@
 """Radii once more, with the axes held: what smooths a vessel's course rounds off a stenosis.
 
-The fit of ``tube.py`` has to find where a vessel runs, and its prior on the radius, a random walk
-of the logarithm with Gaussian steps, keeps ghosts and overlaps from bending it. A narrow core pays
-for its two steep flanks there. When the axes stand, the pictures' own pixels say more about the
-radius, and the steps may be rare and large: their prior is Student's t,
+The fit of ``gauss_newton`` has to find where a vessel runs, and its prior on the radius, a random
+walk of the logarithm with Gaussian steps, keeps ghosts and overlaps from bending it. A narrow core
+pays for its two steep flanks there. When the axes stand, the pictures' own pixels say more about
+the radius, and the steps may be rare and large: their prior is Student's t,
 
     0.5 (nu + 1) log(1 + z^2 / nu),   z = step of log radius / (walk sqrt(gap in mm)),
 
@@ -106,7 +106,7 @@ def _pictures(
         weight, error = weights_of(target, seen, options)
         t, slope = seen.t, seen.d_log_radius
         s = 1 - t
-        # Crossings majorise the coupling of vessels that share a ray, as in ``tube.py``.
+        # Crossings majorise the coupling of vessels that share a ray, as in ``gauss_newton``.
         curve = weight * seen.crossings * slope**2
         force = weight * error * slope
         of_first, of_second, of_both, *forces = sums_of(

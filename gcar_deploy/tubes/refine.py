@@ -53,7 +53,8 @@ class Refined:
     tree : Tree
         Where the refiner has none of its own (``paper``), made of ``centers`` as they are, or, of
         centres of single views, which are no vessels yet, of the fitted Gaussians.
-    losses : (k,) objective after each accepted step
+    losses : (k,) objective where each fit starts and after each accepted step; of ``paper`` the
+        loss before each step
     steps, rejected_steps : int
     status : str
         ``ok``; ``stopped`` (deadline or cancel: the best so far); ``late`` (no time to begin);
