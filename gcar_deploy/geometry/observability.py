@@ -2,13 +2,13 @@
 
 The bound of a point from pixel noise sigma_px is C = sigma_px^2 (J^T J)^-1 with J the stacked
 Jacobians of all views. Two views at angle theta, parallel beams and s = sigma_px times the pixel
-at the isocentre give the closed form RMSE = s sqrt(1/2 + 2 / sin^2 theta).
+at the isocentre give the closed form RMSE = s sqrt(1/2 + 2 / sin^2 theta). Along a vessel nothing
+is measured: there the bound is that across it (``worst_across``).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import enum
 import itertools
 import math
 from collections.abc import Sequence
@@ -24,29 +24,11 @@ from gcar_deploy.types import Array, Points, Scalars
 RELATIVE_CUTOFF = 1e-6
 #: a view that looks along the vessel within this angle measures nothing of it
 ALONG_BEAM_DEG = 5.0
-#: bounds between the classes, in units of the noise at the isocentre
-WEAK, NONE = 3.0, 10.0
 #: profiles of calibrated pictures that agree so well (``consistency.disagreement``) rule out an
 #: angle error of a degree, which makes them differ by more
 EXACT_DISAGREEMENT = 0.003
 #: an error counts as silent if the pictures show less than this share of its effect
 SILENT_SHARE = 0.05
-
-
-class Observability(enum.IntEnum):
-    """How well a centreline point is determined across the vessel."""
-
-    GOOD = 0
-    WEAK = 1
-    NONE = 2
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GeometryPrior:
-    """One standard deviation of what a scene file may be wrong by, per view."""
-
-    angle_deg: float = 0.5
-    offset_mm: float = 1.0
 
 
 def point_sigmas(
@@ -70,27 +52,6 @@ def point_sigmas(
     with np.errstate(divide="ignore"):
         sigma = np.where(singular > RELATIVE_CUTOFF * singular[:, :1], sigma_px / singular, np.inf)
     return sigma, axes
-
-
-def curve_sigmas(
-    carms: Sequence[CArm], points_mm: Points, tangents: Points, sigma_px: float = 1.0
-) -> Scalars:
-    """Worst standard deviation across a vessel, where along it nothing is measured.
-
-    Parameters
-    ----------
-    carms : views
-    points_mm, tangents : (n, 3) mm LPS, unit vectors
-    sigma_px : float, noise in every view, pixels
-
-    Returns
-    -------
-    (n,) mm; inf where at most one view measures
-    """
-    information = np.zeros((len(points_mm), 3, 3))
-    for carm in carms:
-        information += curve_information(carm, points_mm, tangents)
-    return sigma_px * worst_across(information)
 
 
 def curve_information(carm: CArm, points_mm: Points, tangents: Points) -> Array:
@@ -126,7 +87,11 @@ def information_from(
 
 
 def worst_across(information: Array) -> Scalars:
-    """(...) standard deviation in the worse direction across a vessel, mm; see ``curve_sigmas``."""
+    """(...) standard deviation in the worse direction across a vessel, mm, for 1 px of noise.
+
+    ``information`` (..., 3, 3) is what ``curve_information`` of all views adds up to; inf where at
+    most one view measures.
+    """
     # Only the plane across the vessel counts: along T the information is nil by construction. Of
     # the other two eigenvalues the trace is the sum, the principal minors add up to the product.
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = np.moveaxis(information, (-2, -1), (0, 1))
@@ -139,12 +104,6 @@ def worst_across(information: Array) -> Scalars:
             low > RELATIVE_CUTOFF * high, 1.0 / np.sqrt(np.maximum(low, 1e-300)), np.inf
         )
     return out
-
-
-def classes(sigma_mm: Scalars, noise_mm: float) -> Array:
-    """(n,) Observability of standard deviations against the noise at the isocentre."""
-    ratio = np.asarray(sigma_mm) / noise_mm
-    return np.where(ratio < WEAK, 0, np.where(ratio <= NONE, 1, 2)).astype(np.int64)
 
 
 def depth_and_plane(
@@ -171,34 +130,6 @@ def depth_and_plane(
     return np.sqrt(np.maximum(depth2, 0.0)), np.sqrt(np.maximum(plane2, 0.0))
 
 
-def geometry_sigmas(
-    carms: Sequence[CArm], points_mm: Points, prior: GeometryPrior | None = None
-) -> Scalars:
-    """Propagate errors of the geometry itself to triangulated points.
-
-    Each view but the first is turned and moved by one standard deviation in turn; the shift of
-    the triangulated point by finite differences adds up in squares.
-
-    Returns
-    -------
-    (n,) mm, root sum of squares over all parameters and axes
-    """
-    prior = prior or GeometryPrior()
-    total = np.zeros(len(points_mm))
-    steps = [
-        (prior.angle_deg, lambda c, s: c.turned(primary_deg=s)),
-        (prior.angle_deg, lambda c, s: c.turned(secondary_deg=s)),
-        *[(prior.offset_mm, lambda c, s, k=k: c.moved(np.eye(3)[k] * s)) for k in range(3)],
-    ]
-    for k in range(1, len(carms)):
-        for size, change in steps:
-            moved = list(carms)
-            moved[k] = change(carms[k], 0.1 * size)
-            shift = _triangulation_shift(carms, moved, points_mm) / 0.1
-            total += np.sum(shift**2, axis=1)
-    return np.sqrt(total)
-
-
 def _triangulation_shift(told: Sequence[CArm], true: Sequence[CArm], points_mm: Points) -> Points:
     """(n, 3) linearised error of points seen by ``true`` and triangulated with ``told``."""
     J = np.concatenate([carm.jacobian(points_mm) for carm in told], axis=1)
@@ -210,12 +141,6 @@ def _triangulation_shift(told: Sequence[CArm], true: Sequence[CArm], points_mm: 
         axis=1,
     )
     return np.einsum("nij,nj->ni", np.linalg.pinv(J, rcond=RELATIVE_CUTOFF), change)
-
-
-def rmse_two_views(theta_deg: float, noise_mm: float = 1.0) -> float:
-    """Return s sqrt(1/2 + 2 / sin^2 theta), the bound for two parallel beams at ``theta_deg``."""
-    sine = math.sin(math.radians(theta_deg))
-    return noise_mm * math.sqrt(0.5 + 2.0 / sine**2) if abs(sine) > 1e-12 else math.inf
 
 
 def silent_errors(carms: Sequence[CArm], *, exact: bool = False) -> tuple[str, ...]:

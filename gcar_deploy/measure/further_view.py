@@ -48,9 +48,8 @@ class FurtherView:
 def best_further_view(tree: Tree, carms: Sequence[CArm]) -> FurtherView | None:
     """Search the directions a C-arm reaches, in steps of 10 degrees.
 
-    The measure is the mean Cramer-Rao bound across the vessel
-    (``observability.curve_sigmas``), which counts
-    what is foreshortened by itself; None for a tree without a branch.
+    The measure is the mean Cramer-Rao bound across the vessel (``observability.worst_across``),
+    which counts what is foreshortened by itself; None for a tree without a branch.
     """
     if not tree.branches:
         return None

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gcar_deploy.geometry.carm import CArm, separation_deg
-from gcar_deploy.geometry.observability import curve_sigmas
 from gcar_deploy.measure.further_view import best_further_view
 from gcar_deploy.tree.tree import empty_tree
+from tests.geometry.test_observability import curve_sigmas
 from tests.tree.shapes import fork, tube
 
 
