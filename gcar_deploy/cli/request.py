@@ -11,7 +11,6 @@ from typing import Any, TypeAlias, TypeVar
 import click
 
 from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions
-from gcar_deploy.geometry.fields import MOST_VIEWS
 from gcar_deploy.inputs.order import EXTRAS, POSES, Order, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_lesion, parse_mask
 
@@ -103,8 +102,6 @@ READING = (
 METHOD = ("predictor", "refiner", "deadline_s")
 #: options that ask for further files
 EXTRA_FILES = {name.replace("-", "_"): name for name in EXTRAS}
-#: the old spelling of --mask, still understood
-_SHORT_MASKS = {f"mask{k}": k for k in range(1, MOST_VIEWS + 1)}
 
 
 def order_options(*fields: str) -> Callable[[_Function], Any]:
@@ -121,10 +118,8 @@ def order_options(*fields: str) -> Callable[[_Function], Any]:
             own = {name: values.pop(name) for name in list(values) if name in known}
             return function(order=made_order(own), **values)
 
-        known = {*fields, "views", *_SHORT_MASKS}
+        known = {*fields, "views"}
         command: Any = wrapper
-        for name in _SHORT_MASKS if "masks" in fields else ():
-            command = click.option(f"--{name}", type=_FILE, hidden=True)(command)
         for name in reversed([name for name in OPTIONS if name in fields]):
             command = OPTIONS[name](command)
         return command
@@ -143,7 +138,6 @@ def made_order(said: Mapping[str, Any]) -> Order:
     values = {name: value for name, value in said.items() if value not in (None, (), False)}
     file = values.pop("file", None)
     masks = dict(parse_mask(text) for text in values.pop("masks", ()))
-    masks |= {k: values.pop(name) for name, k in _SHORT_MASKS.items() if name in values}
     extras = [name for option, name in EXTRA_FILES.items() if values.pop(option, False)]
     if masks:
         values["masks"] = masks

@@ -37,14 +37,13 @@ def test_a_landmark_and_what_the_result_says_of_it(good_case, tmp_path):
         (("--landmark", "1,2"), 2, "1 points for 2 views"),
         (("--landmark", "1,2:900,3"), 2, "outside"),
         (("--landmark", "1,2:3,4", "--pose", "off"), 2, "pose off"),
-        (("--mask3", "view1.png"), 2, "views 1 .. 2"),
+        (("--mask", "3:view1.png"), 2, "views 1 .. 2"),
         (("--mask", "16:m.png"), 2, "views 1 .. 2"),
         (("--mask", "17:m.png"), 2, "N:FILE"),
-        (("--mask1", "missing.png"), 3, "missing.png"),
+        (("--mask", "1:missing.png"), 3, "missing.png"),
     ],
 )
 def test_refused(good_case, tmp_path, arguments, code, words):
-    arguments = [good_case / a if a == "view1.png" else a for a in arguments]
     done = run(good_case, tmp_path / "r", *arguments)
     assert done.code == code and words in done.err.splitlines()[-1]
     assert not (tmp_path / "r").exists()
@@ -65,7 +64,7 @@ def test_a_mask_wins(good_case, tmp_path):
     mask[: mask.shape[0] // 2] = 0
     cv2.imwrite(str(tmp_path / "m.png"), mask)
     whole = json.loads(run(good_case, tmp_path / "a", "--json").out)
-    done = run(good_case, tmp_path / "b", "--mask1", tmp_path / "m.png", "--json")
+    done = run(good_case, tmp_path / "b", "--mask", f"1:{tmp_path / 'm.png'}", "--json")
     assert done.code in (0, 6), done.err
     if done.code == 0:
         found = json.loads(done.out)
@@ -73,4 +72,4 @@ def test_a_mask_wins(good_case, tmp_path):
         assert any("mask is the user's" in note for note in found["notes"])
     small = tmp_path / "s.png"
     cv2.imwrite(str(small), mask[:20, :20])
-    assert run(good_case, tmp_path / "c", "--mask1", small).code == 3
+    assert run(good_case, tmp_path / "c", "--mask", f"1:{small}").code == 3

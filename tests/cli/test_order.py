@@ -51,9 +51,7 @@ def test_the_command_line_goes_before_the_file(tmp_path):
     (tmp_path / "o.json").write_text(
         '{"views": ["a", "b"], "sod_mm": 700, "refiner": "paper", "masks": {"1": "m"}}'
     )
-    order = made_order(
-        {"file": tmp_path / "o.json", "sod_mm": 800.0, "force": False, "mask2": None}
-    )
+    order = made_order({"file": tmp_path / "o.json", "sod_mm": 800.0, "force": False})
     assert (order.sod_mm, order.refiner, order.force) == (800.0, "paper", False)
     assert order.masks == {1: tmp_path / "m"}
     assert made_order({"masks": ("2:x.png",), "glb": True, "frames": "3,auto"}) == Order(
@@ -113,13 +111,13 @@ def test_a_mask_of_the_fifth_view_is_read(good_case, tmp_path):
     ]
     (tmp_path / "g.json").write_text(json.dumps(geometry))
     cv2.imwrite(str(tmp_path / "m.png"), np.eye(20, dtype=np.uint8))
-    for option in (("--mask", f"5:{tmp_path / 'm.png'}"), ("--mask5", tmp_path / "m.png")):
-        done = gcar("run", *[good_case / "view1.png"] * 5, "--geom", tmp_path / "g.json",
-                    "--out", tmp_path / "r", *option)  # fmt: skip
-        assert done.code == 3 and "mask 5 has (20, 20)" in done.err
-        checked = gcar("validate", *[good_case / "view1.png"] * 5, "--geom", tmp_path / "g.json",
-                       *option)  # fmt: skip
-        assert checked.code == 3 and "mask 5" in checked.err
+    option = ("--mask", f"5:{tmp_path / 'm.png'}")
+    done = gcar("run", *[good_case / "view1.png"] * 5, "--geom", tmp_path / "g.json",
+                "--out", tmp_path / "r", *option)  # fmt: skip
+    assert done.code == 3 and "mask 5 has (20, 20)" in done.err
+    checked = gcar("validate", *[good_case / "view1.png"] * 5, "--geom", tmp_path / "g.json",
+                   *option)  # fmt: skip
+    assert checked.code == 3 and "mask 5" in checked.err
 
 
 @pytest.mark.slow
