@@ -66,11 +66,11 @@ def frame_carm(header: Header, frame: int, options: DicomOptions) -> tuple[CArm,
     return carm, notes
 
 
-def unsaid(header: Header, frame: int = 0) -> tuple[str, ...]:
+def unsaid(header: Header) -> tuple[str, ...]:
     """Name the fields of ``DicomOptions`` that must say what the header of a run does not."""
     own = {
-        "pixel_spacing_mm": header.pair("ImagerPixelSpacing", frame),
-        "sod_mm": _own_sod(header, frame),
+        "pixel_spacing_mm": header.pair("ImagerPixelSpacing"),
+        "sod_mm": _own_sod(header, 0),
     }
     return tuple(key for key, value in own.items() if not value)
 

@@ -72,7 +72,7 @@ def model_0d(tree: Tree, drop: PressureDrop) -> dict[str, Any]:
             "viscosity": drop.assumed.viscosity_pa_s * 10.0,
         },
         "boundary_conditions": conditions,
-        "junctions": _junctions(drop, ends, vessels),
+        "junctions": _junctions(drop, ends),
         "vessels": vessels,
     }  # fmt: skip
 
@@ -104,9 +104,7 @@ def _pieces(branch: Branch, number: int, drop: PressureDrop) -> list[dict[str, A
     return out
 
 
-def _junctions(
-    drop: PressureDrop, ends: dict[int, tuple[int, int]], vessels: list[dict[str, Any]]
-) -> list[dict[str, Any]]:
+def _junctions(drop: PressureDrop, ends: dict[int, tuple[int, int]]) -> list[dict[str, Any]]:
     pairs: list[tuple[int, list[int]]] = []
     for k in drop.network.order:
         first, last = ends[k]

@@ -34,9 +34,7 @@ class SeenRun:
 
 
 def choose_frames(
-    runs: Mapping[int, SeenRun],
-    wanted: Mapping[int, int | None],
-    report: Callable[[float], None] | None = None,
+    runs: Mapping[int, SeenRun], wanted: Mapping[int, int | None]
 ) -> dict[int, ChosenFrame]:
     """Choose frames of runs together; of those at rest, or too short, none.
 
@@ -47,7 +45,6 @@ def choose_frames(
     ----------
     runs : number of the view, from 1 -> run
     wanted : number of the view -> frame that is asked for, from 1, None to choose
-    report : told the share done, 0 .. 1
 
     Returns
     -------
@@ -62,8 +59,8 @@ def choose_frames(
     if len(able) < 2 or all(wanted[k] is not None for k in able):
         return {}
     seen: dict[int, RunMasses] = {}
-    for at, k in enumerate(able):
-        found = masses_of(runs[k], _part(report, at, len(able)))
+    for k in able:
+        found = masses_of(runs[k])
         if found.beats:
             seen[k] = found
     out: dict[int, ChosenFrame] = {}
@@ -129,13 +126,6 @@ def _chosen(pair: FramePair, place: int, run: SeenRun, partner: int) -> ChosenFr
         number=own, of=len(run.cine), pair=pair, partner=partner,
         reason=f"goes with frame {other} of view {partner} (score {pair.score:.2f}{margin})",
     )  # fmt: skip
-
-
-def _part(
-    report: Callable[[float], None] | None, at: int, of: int
-) -> Callable[[float], None] | None:
-    """Tell of part ``at`` what share of the whole is done."""
-    return None if report is None else lambda share: report((at + share) / of)
 
 
 def _told(report: Callable[[float], None] | None, done: float, of: int) -> None:

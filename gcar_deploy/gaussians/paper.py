@@ -49,7 +49,6 @@ class PaperResult:
     gaussians : Gaussians
     losses : loss before each step, mm^2
     steps, rejected_steps : int
-    pruned : reason -> how many Gaussians went
     status : ``ok``, ``stopped`` (by the caller) or ``failed`` (numbers not finite)
     contrast : per view, factor of the picture's path on the model's, 1 where calibrated
     """
@@ -58,7 +57,6 @@ class PaperResult:
     losses: tuple[float, ...]
     steps: int
     rejected_steps: int
-    pruned: dict[str, int]
     status: str
     contrast: tuple[float, ...]
 
@@ -130,8 +128,7 @@ def refine_paper(
     should_stop : asked before every step
     """
     gaussians = start if isinstance(start, Gaussians) else initial_gaussians(start, options)
-    over = len(gaussians) - options.most_gaussians
-    if over > 0:
+    if len(gaussians) > options.most_gaussians:
         heavy = np.argsort(-gaussians.masses_mm3(), kind="stable")[: options.most_gaussians]
         gaussians = gaussians.select(np.sort(heavy))
     backend = backend_named(options.backend, options.device)
@@ -141,7 +138,6 @@ def refine_paper(
     free, adam = _capped(_freed(gaussians, scaling), scaling), _adam(options)
     losses: list[float] = []
     rejected = in_a_row = 0
-    pruned: dict[str, int] = {"cap": over} if over > 0 else {}
     gaussians = _bound(free, scaling)
     best, status, step = (np.inf, gaussians, (1.0,) * len(views)), "ok", 0
     for step in range(options.steps):
@@ -167,7 +163,7 @@ def refine_paper(
             break
         free = _capped({name: value + moves[name] for name, value in free.items()}, scaling)
         if options.control_every and step and step % options.control_every == 0:
-            free = _controlled(free, gradient, scaling, options, finest, pruned)
+            free = _controlled(free, gradient, scaling, options, finest)
             adam.restart()
         if on_progress is not None:
             on_progress((step + 1) / options.steps)
@@ -176,7 +172,6 @@ def refine_paper(
         losses=tuple(losses),
         steps=len(losses),
         rejected_steps=rejected,
-        pruned=pruned,
         status=status,
         contrast=best[2],
     )
@@ -307,7 +302,6 @@ def _controlled(
     scaling: _Scaling,
     options: PaperOptions,
     pixel_mm: float,
-    pruned: dict[str, int],
 ) -> dict[str, Array]:
     """Clone small Gaussians that pull hard, split large ones, drop the light; keep the cap."""
     g = _bound(free, scaling)
@@ -320,7 +314,4 @@ def _controlled(
     g = clone(split(g, splitting), cloning, gradient.means_mm[cloning])
     mass = g.masses_mm3()
     least = options.least_mass_share * float(np.median(mass)) if len(mass) else 0.0
-    g, reasons = prune(g, least)
-    for reason, count in reasons.items():
-        pruned[reason] = pruned.get(reason, 0) + count
-    return _freed(g, scaling)
+    return _freed(prune(g, least)[0], scaling)

@@ -55,10 +55,10 @@ def network_scale(rows: int, columns: int, finest: int = FINEST_SIDE) -> float:
     return min(float(np.clip(side, SIDE, finest)) / side, _LONGEST / max(rows, columns))
 
 
-def at_network_size(picture: Image, holes: Mask, finest: int = FINEST_SIDE) -> tuple[Image, Mask]:
+def at_network_size(picture: Image, holes: Mask) -> tuple[Image, Mask]:
     """Return picture and holes at the size that the network looks at."""
     rows, columns = picture.shape
-    scale = network_scale(rows, columns, finest)
+    scale = network_scale(rows, columns)
     size = (max(STRIDE, round(columns * scale)), max(STRIDE, round(rows * scale)))
     work = resize(enhance.fill_holes(picture, holes), size)
     return work, resize(holes.astype(np.float32), size) > 0.1

@@ -49,8 +49,6 @@ class Segmentation:
     ----------
     mask, skeleton, valid : (rows, cols) bool
     vesselness : (rows, cols) float32, units of the picture
-    rim_share : (rows, cols) float32
-        Level of the mask's rim as a share of the peak on the nearest skeleton pixel.
     peak : float
         Mean rise of the skeleton above the background, units of the picture.
     contrast : float
@@ -67,7 +65,6 @@ class Segmentation:
     skeleton: Mask
     valid: Mask
     vesselness: Image
-    rim_share: Image
     peak: float
     contrast: float
     catheter: Mask
@@ -109,10 +106,9 @@ def segment(
     vesselness = np.where(holes, np.float32(0), resize(response, full))
     if not line.any():
         nothing = np.zeros((rows, columns), bool)
-        share = np.zeros((rows, columns), np.float32)
         return Segmentation(
             mask=nothing, skeleton=nothing, valid=~holes, vesselness=vesselness,
-            rim_share=share, peak=0.0, contrast=0.0, catheter=nothing, catheter_mm=0.0,
+            peak=0.0, contrast=0.0, catheter=nothing, catheter_mm=0.0,
         )  # fmt: skip
     rim = _rim(work, flat, line, device, found.sigma_px, work_mm)
     mask = _draw(picture, holes, line, rim, pixel_mm)
@@ -121,7 +117,6 @@ def segment(
         skeleton=skel.skeletonize(mask),
         valid=~holes,
         vesselness=vesselness,
-        rim_share=resize(rim.share, full),
         peak=rim.peak,
         contrast=rim.contrast,
         catheter=(resize(device.astype(np.float32), full) > 0.5) & ~mask,
@@ -201,7 +196,6 @@ def given(picture: Image, mask: Mask, holes: Mask, pixel_mm: float) -> Segmentat
         skeleton=line,
         valid=~holes,
         vesselness=np.where(mask, np.clip(rise, 0, None), np.float32(0)),
-        rim_share=np.zeros(picture.shape, np.float32),
         peak=peak,
         contrast=peak / max(noise, 1e-12) if line.any() else 0.0,
         catheter=np.zeros_like(mask),
@@ -233,7 +227,6 @@ class _Rim:
     ground: Image
     level: Image
     room: Image
-    share: Image
     peak: float
     contrast: float
 
@@ -278,7 +271,6 @@ def _rim(
         ground=work - flat + ground,
         level=level,
         room=room,
-        share=level / peak,
         peak=float(peak[line].mean()),
         contrast=float(peak[line].mean() / max(noise, 1e-12)),
     )

@@ -11,6 +11,8 @@ from gcar_deploy.types import Array, Image, Mask, Scalars
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 #: of a line so much is looked at to each side, pixels
 _AROUND_PX = 12
+#: passes in which ends are cut: cutting one makes another
+PRUNINGS = 3
 _BLOCK = np.ones((3, 3), np.uint8)
 
 
@@ -77,10 +79,8 @@ def stretches(skeleton: Mask) -> tuple[int, Array]:
     return cv2.connectedComponents((skeleton & ~forks).astype(np.uint8), connectivity=8)
 
 
-def prune(
-    skeleton: Mask, strength: Image, shortest_px: float, weakest: float, passes: int = 3
-) -> Mask:
-    """Cut ends that are short or weak.
+def prune(skeleton: Mask, strength: Image, shortest_px: float, weakest: float) -> Mask:
+    """Cut ends that are short or weak, in ``PRUNINGS`` passes at most.
 
     Parameters
     ----------
@@ -90,10 +90,8 @@ def prune(
         A segment between an end and a fork with fewer pixels is a spur.
     weakest : float
         An end segment with a lower mean strength goes, however long.
-    passes : int
-        Cutting one end makes another.
     """
-    for _ in range(passes):
+    for _ in range(PRUNINGS):
         count = neighbours(skeleton)
         forks = skeleton & (count >= 3)
         segments = skeleton & ~forks

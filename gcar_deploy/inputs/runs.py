@@ -92,9 +92,7 @@ def find_runs(
     return Runs(cines={k: c for k, c in opened.items() if c is not None}, wanted=wanted)
 
 
-def together(
-    runs: Runs, seen: Mapping[int, SeenRun], report: Report | None = None
-) -> dict[int, ChosenFrame]:
+def together(runs: Runs, seen: Mapping[int, SeenRun]) -> dict[int, ChosenFrame]:
     """Choose the frames of the runs such that they go together.
 
     Returns
@@ -103,7 +101,7 @@ def together(
     """
     if not _chooses(runs.wanted):
         return {}
-    return choose_frames(seen, {k: runs.wanted[k] for k in seen}, report)
+    return choose_frames(seen, {k: runs.wanted[k] for k in seen})
 
 
 def with_bare(

@@ -27,6 +27,8 @@ PROJECTION_THRESHOLD_MM = 0.5
 VOLUME_MEASURES = (
     "dsc", "best_dsc", "best_threshold", "ot_1mm", "ot_2mm", "chamfer_mm", "cldice", "ssim",
 )  # fmt: skip
+#: farthest shift that ``best_shifted_dice`` tries on each axis, voxels
+SHIFTED = 3
 #: window edge of SSIM, voxels.
 SSIM_WINDOW = 7
 #: slack on "within r mm", so that a distance equal to r counts whatever its rounding.
@@ -250,11 +252,11 @@ def projection_measures(truth_mm: Array, predicted_mm: Array | None) -> dict[str
     }
 
 
-def best_shifted_dice(truth: Array, predicted: Array | None, reach: int = 3) -> Measure:
-    """Highest ``volume_dice`` over whole-voxel shifts of the prediction up to ``reach``.
+def best_shifted_dice(truth: Array, predicted: Array | None) -> Measure:
+    """Highest ``volume_dice`` over shifts of the prediction by up to ``SHIFTED`` whole voxels.
 
     For pictures of a patient who moved between the views: no pair of views can see the
-    common shift. Shifts run over -reach .. reach on each axis.
+    common shift. Shifts run over -SHIFTED .. SHIFTED on each axis.
     """
     _same_shape(truth, predicted)
     mask = truth >= VOLUME_THRESHOLD
@@ -264,8 +266,8 @@ def best_shifted_dice(truth: Array, predicted: Array | None, reach: int = 3) -> 
         return Measure(None, reason)
     size = np.count_nonzero(mask) + np.count_nonzero(moved)
     index = np.argwhere(moved)
-    padded = np.pad(mask, reach)
-    steps = range(0, 2 * reach + 1)
+    padded = np.pad(mask, SHIFTED)
+    steps = range(0, 2 * SHIFTED + 1)
     hits = (
         np.count_nonzero(padded[tuple((index + np.array([i, j, k])).T)])
         for i in steps

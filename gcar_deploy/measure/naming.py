@@ -125,15 +125,12 @@ class Template:
         return out
 
 
-def read_anatomy(
-    tree: Tree, least: float = LEAST_CONFIDENCE, usual: Mapping[str, Template] | None = None
-) -> Anatomy:
+def read_anatomy(tree: Tree, usual: Mapping[str, Template] | None = None) -> Anatomy:
     """Name what can be named of a tree.
 
     Parameters
     ----------
     tree : Tree, mm LPS; its place does not matter, its directions do
-    least : probability from which on a branch is named
     usual : what is usual on each side; None takes that of the package
     """
     names: list[BranchName | None] = [None] * len(tree.branches)
@@ -147,12 +144,12 @@ def read_anatomy(
         shares = probabilities(found, usual or templates())
         for number, chances in _chances(found, shares).items():
             name = max(chances, key=lambda n: chances[n])
-            if chances[name] >= least:
+            if chances[name] >= LEAST_CONFIDENCE:
                 names[number] = BranchName(name=name, confidence=chances[name])
         ostia: dict[int, float] = {}
         for reading, share in zip(found, shares, strict=True):
             ostia[reading.inlet] = ostia.get(reading.inlet, 0.0) + float(share)
-        inlets += [node for node, share in ostia.items() if share >= least]
+        inlets += [node for node, share in ostia.items() if share >= LEAST_CONFIDENCE]
     if _contradicting(tree, names):
         return Anatomy(names=(None,) * len(names), inlets=())
     return Anatomy(names=tuple(names), inlets=tuple(inlets))

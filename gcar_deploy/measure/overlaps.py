@@ -11,6 +11,8 @@ from gcar_deploy.types import Array, Points, Scalars
 
 #: what lies within so many of the own radii is the own lumen: a branch begins there
 OWN_RADII = 1.2
+#: a place so many of its radii beside a wider vessel is still within it
+BESIDE_RADII = 0.5
 #: the same vessel is no overlap within so many radii along it, and so many mm
 NEAR_RADII, NEAR_MM = 3.0, 2.0
 
@@ -38,19 +40,17 @@ class Course:
     px_per_mm: Scalars
 
 
-def within_others(
-    points_mm: Points, radius_mm: Scalars, branch: Array, share: float = 0.5
-) -> Array:
-    """(n,) whether a place lies in, or by less than a share of its radius beside, a wider vessel.
+def within_others(points_mm: Points, radius_mm: Scalars, branch: Array) -> Array:
+    """(n,) whether a place lies in, or by ``BESIDE_RADII`` of its own beside, a wider vessel.
 
     A branch that leaves its parent at a small angle has no lumen of its own before that.
     """
     lookup = cKDTree(points_mm)
-    far = (1 + share) * float(radius_mm.max(initial=0.0))
+    far = (1 + BESIDE_RADII) * float(radius_mm.max(initial=0.0))
     pairs = lookup.sparse_distance_matrix(lookup, far, output_type="ndarray")
     i, j = pairs["i"], pairs["j"]
     within = (branch[i] != branch[j]) & (radius_mm[j] > radius_mm[i])
-    within &= pairs["v"] < radius_mm[j] + share * radius_mm[i]
+    within &= pairs["v"] < radius_mm[j] + BESIDE_RADII * radius_mm[i]
     out = np.zeros(len(points_mm), bool)
     out[i[within]] = True
     return out

@@ -54,9 +54,9 @@ MODEL_SD = 0.03
 CORRELATED, CORRELATED_GREY = 2.0, 16.0
 #: error of the vessel's direction, which the path along a slanting ray magnifies, rad
 TILT_SD = 0.07
-#: foreshortened: the ray runs within this angle of the vessel (sine); overlapped: this share of
-#: the lumen lies in another vessel's shadow
-SHORT_SINE, OVERLAP_SHARE = 0.5, 0.3
+#: overlapped: this share of the lumen lies in another vessel's shadow; a profile is clear where
+#: the ray leaves the vessel at a sine above this as well
+OVERLAP_SHARE, CLEAR_SINE = 0.3, 0.85
 #: error of a log radius that one view alone shows: another vessel, or an axis that is off, would
 #: not be noticed
 ALONE_SD = 0.1
@@ -79,7 +79,7 @@ class Sections:
     sigma_mm : (m,) its standard deviation
     measured : (m,) whether a view shows it; else it is what lies between those that are
     width_mm : (views, m) extent across each view's ray; NaN where it is not seen
-    foreshortened, overlapped : (views, m) stretches that count little or not
+    overlapped : (views, m) stretches that count little or not
     """
 
     arc_mm: Scalars
@@ -87,7 +87,6 @@ class Sections:
     sigma_mm: Scalars
     measured: Array
     width_mm: Array
-    foreshortened: Array
     overlapped: Array
 
 
@@ -159,7 +158,6 @@ def sections_of_radii(tree: Tree) -> tuple[Sections, ...]:
                 sigma_mm=np.full(len(branch), np.nan),
                 measured=np.ones(len(branch), bool),
                 width_mm=blank,
-                foreshortened=blank.astype(bool),
                 overlapped=blank.astype(bool),
             )
         )
@@ -206,7 +204,7 @@ def _seen(places: _Places, signal: Signal) -> _Seen:
     share = (x[:, 1] - x[:, 0]) * STEP_MM / pixel**2
     weight = (shown & ~hidden & (depth > 1.0)[:, None]) * np.minimum(share, 1e3)[:, None]
     profiles = Profiles(x, value, weight)
-    clear = ~overlapped & (sine > 2 * SHORT_SINE * 0.85) & shown.all(axis=1) & ~hidden.any(axis=1)
+    clear = ~overlapped & (sine > CLEAR_SINE) & shown.all(axis=1) & ~hidden.any(axis=1)
     stretch = 1.0 / np.maximum(sine, 0.2)
     log_radius, sd, width = _fitted(profiles, stretch, places, signal, clear)
     # A slanting ray's path changes with the angle: d log(1 / sine) = cosine / sine d angle.
@@ -379,9 +377,8 @@ def _joined(places: _Places, own: Array, seen: Sequence[_Seen]) -> Sections:
     sd = np.hypot(sd, ALONE_SD * alone)
     start = np.log(places.radius_mm[own])
     stiff = 1.0 / (WALK**2 * np.maximum(np.diff(arc), 1e-3))
-    x, n = start.copy(), len(arc)
-    best = np.clip((value / sd**2).sum(0) / (1 / sd**2).sum(0), start - 1.5, start + 1.5)
-    x = best
+    x = np.clip((value / sd**2).sum(0) / (1 / sd**2).sum(0), start - 1.5, start + 1.5)
+    n = len(arc)
     band = np.zeros((2, n))
     for _ in range(6):
         data = 1.0 / sd**2 / (1 + ((value - x) / (2 * sd)) ** 2)
@@ -401,7 +398,6 @@ def _joined(places: _Places, own: Array, seen: Sequence[_Seen]) -> Sections:
         sigma_mm=diameter * spread,
         measured=known,
         width_mm=np.where(sd < 1.0, np.stack([view.width_mm[own] for view in seen]), np.nan),
-        foreshortened=np.stack([view.sine[own] < SHORT_SINE for view in seen]),
         overlapped=np.stack([view.overlapped[own] for view in seen]),
     )
 

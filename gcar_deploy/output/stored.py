@@ -143,8 +143,7 @@ def _lumen(text: str, told: list[dict[str, Any]]) -> tuple[Tree, tuple[Sections,
         sections.append(
             Sections(
                 arc_mm=branches[-1].arc_mm, diameter_mm=own[:, 5], sigma_mm=own[:, 6],
-                measured=own[:, 8] > 0, width_mm=blank, foreshortened=blank.astype(bool),
-                overlapped=blank.astype(bool),
+                measured=own[:, 8] > 0, width_mm=blank, overlapped=blank.astype(bool),
             )
         )  # fmt: skip
     if sum(len(branch) for branch in branches) != len(table):

@@ -47,7 +47,7 @@ def decide(centers: CenterPoints, encoded: Encoded, path_error: float) -> Center
     x = expit(evidence)
     neighbours = _adjacent(encoded.neighbours[0])
     for step in range(STEPS):
-        share = step / max(STEPS - 1, 1)
+        share = step / (STEPS - 1)
         beta = 1.0 + (FINAL_SHARPNESS - 1.0) * share
         enough = np.minimum(neighbours @ x, ENOUGH_NEIGHBOURS) - 0.5 * ENOUGH_NEIGHBOURS
         field = beta * (evidence + COUPLING * enough)

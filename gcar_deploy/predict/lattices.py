@@ -27,9 +27,7 @@ ASKED_AGAIN = 0.15
 
 
 def shifted_lattice(lattice: Grid, number: int) -> Grid:
-    """Return ``lattice`` moved by its share of a cell; number 0 is the lattice itself."""
-    if number == 0:
-        return lattice
+    """Return ``lattice`` moved by its share of a cell (``SHIFTS``)."""
     x, y, z = np.asarray(lattice.center_mm) + np.asarray(SHIFTS[number]) * lattice.spacing_mm
     return dataclasses.replace(lattice, center_mm=(float(x), float(y), float(z)))
 

@@ -19,22 +19,14 @@ from gcar_deploy.types import Array, Scalars
 STEPS, SHARPNESS = 40, 1.05
 
 
-def thin_hull(
-    candidates: Candidates,
-    encoded: Encoded,
-    start: Scalars | None = None,
-) -> CenterPoints:
+def thin_hull(candidates: Candidates, encoded: Encoded) -> CenterPoints:
     """Share the path of every ray among the hull points behind it.
-
-    Parameters
-    ----------
-    start : (n,) 0 .. 1, what is believed of each point beforehand; None for the even share
 
     Returns
     -------
     CenterPoints with the occupancy as confidence and no radius; ``source = "hull"``.
     """
-    x = np.full(len(candidates), 0.5) if start is None else np.clip(start, 1e-6, 1.0)
+    x = np.full(len(candidates), 0.5)
     for iteration in range(STEPS):
         x = _explain(x, encoded)
         if iteration < STEPS - 3:

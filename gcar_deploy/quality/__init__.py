@@ -19,9 +19,7 @@ from gcar_deploy.quality.ghosts import (
     GHOST_MM,
     PROBABLE,
     GhostModel,
-    Ghosts,
     ghost_share,
-    shipped_model,
 )
 from gcar_deploy.quality.gravity import Part, Remark
 from gcar_deploy.quality.status import (
@@ -38,7 +36,6 @@ __all__ = [
     "GHOST_MM",
     "PROBABLE",
     "GhostModel",
-    "Ghosts",
     "Part",
     "Quality",
     "Remark",
@@ -58,7 +55,6 @@ __all__ = [
     "judge",
     "kind_of",
     "part_lengths_mm",
-    "shipped_model",
     "unexplained",
     "with_hint",
 ]

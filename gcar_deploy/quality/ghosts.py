@@ -87,13 +87,12 @@ class Ghosts:
     figures: Array
 
 
-def find_ghosts(shown: Shown, model: GhostModel | None = None) -> Ghosts | None:
+def find_ghosts(shown: Shown) -> Ghosts | None:
     """State the probability of a ghost along a tree.
 
     Parameters
     ----------
     shown : the tree, its evidence with the C-arms and in the order of its views
-    model : GhostModel; the shipped one where left out
 
     Returns
     -------
@@ -105,7 +104,7 @@ def find_ghosts(shown: Shown, model: GhostModel | None = None) -> Ghosts | None:
         return None
     stretches = stretches_of(tree)
     figures = ghost_figures(shown, evidence, stretches)
-    told = (model or shipped_model()).probability(figures)
+    told = shipped_model().probability(figures)
     along = np.split(told[stretches.point], np.cumsum([len(b) for b in tree.branches])[:-1])
     weight = stretches.length_mm
     whole = np.bincount(stretches.branch, weight)

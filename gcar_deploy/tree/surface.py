@@ -134,7 +134,7 @@ def _merged(vertices: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]
     return vertices[np.concatenate([own, np.flatnonzero(shared)[first]])], of
 
 
-def stl_bytes(surface: Surface, title: str = "lumen, mm, LPS") -> bytes:
+def stl_bytes(surface: Surface) -> bytes:
     """Encode as binary STL."""
     corners = surface.vertices_mm[surface.faces].astype("<f4")
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -144,7 +144,7 @@ def stl_bytes(surface: Surface, title: str = "lumen, mm, LPS") -> bytes:
         len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("pad", "<u2")]
     )
     record["normal"], record["corners"] = normals, corners
-    header = title.encode("ascii", "replace")[:80].ljust(80, b" ")
+    header = b"lumen, mm, LPS".ljust(80)
     return header + struct.pack("<I", len(corners)) + record.tobytes()
 
 

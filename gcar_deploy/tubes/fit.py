@@ -52,7 +52,6 @@ class TubeFit:
     ----------
     tree : Tree with sigma per point; empty where nothing could be built
     centers : CenterPoints the tree was built from
-    scatter_mm : float, estimated scatter of the starting points (0 on a lattice)
     contrast : tuple of float, per view, factor of the picture's path on the model's
     progress : Progress
     model_mm : per view (rows, cols) what the picture's own pixels tell of the tubes; empty where
@@ -62,7 +61,6 @@ class TubeFit:
 
     tree: Tree
     centers: CenterPoints
-    scatter_mm: float
     contrast: tuple[float, ...]
     progress: Progress
     model_mm: tuple[Array, ...] = ()
@@ -88,7 +86,7 @@ def fit_tubes(
         is looked for that the points miss
     """
     progress = Progress()
-    settled_centers, scatter = settled(
+    settled_centers, _ = settled(
         usable_points(centers), [(view.carm, view.path_mm) for view in views]
     )
     if should_stop is not None:
@@ -98,7 +96,6 @@ def fit_tubes(
     fit = TubeFit(
         tree=tree,
         centers=settled_centers,
-        scatter_mm=scatter,
         contrast=(1.0,) * len(views),
         progress=progress,
     )

@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("torch", reason="needs the export extra")
 
 from gcar_deploy.config import QualityOptions
-from gcar_deploy.quality import FIGURES, GhostModel, shipped_model
+from gcar_deploy.quality import FIGURES, GhostModel
+from gcar_deploy.quality.ghosts import shipped_model
 from gcar_export.studies import ghost_fit, status_table
 from gcar_export.studies.gate_rows import Attempt, Row
 from gcar_export.studies.gate_table import expected_ghosts, replayed

@@ -96,13 +96,13 @@ def test_a_vessel_that_no_picture_shows_is_not_measured():
     assert found.measured.mean() < 0.1
 
 
-def test_end_on_is_foreshortened():
+def test_end_on_counts_for_nothing():
     view = two_views(512, 0.3)[0]
     way = view.axes[2] + 0.1 * view.axes[0]
     line = np.linspace(-10, 10, 60)[:, None] * way
     tree = tree_of(np.full(60, 1.5), lines=(line,))
     (found,) = measure_sections(tree, signals_of(tree))
-    assert found.foreshortened[0].all() and not found.foreshortened[1].any()
+    assert np.isnan(found.width_mm[0]).all() and np.isfinite(found.width_mm[1]).any()
 
 
 def test_the_tree_takes_the_diameters():

@@ -19,8 +19,9 @@ from gcar_deploy.errors import CancelledError, ModelError, NumericalError
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.net import KIND as SEGMENTER
 from gcar_deploy.imaging.net import MISSING
-from gcar_deploy.models import Session, shipped_model_path
+from gcar_deploy.models import Session
 from gcar_deploy.models import session as session_module
+from gcar_deploy.models.spec import shipped_model_path
 from gcar_deploy.predict.encoding import input_names
 from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.selftest import tiny_case

@@ -9,6 +9,7 @@ import pytest
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.quality import ghosts
 from gcar_deploy.quality.ghost_figures import FIGURES, STRETCH_MM, ghost_figures, stretches_of
 from gcar_deploy.quality.ghosts import (
     PROBABLE,
@@ -127,11 +128,12 @@ def by_network():
     return GhostModel(np.zeros(len(FIGURES)), np.ones(len(FIGURES)), weight, 0.0)
 
 
-def test_probabilities_go_to_points_branches_tree_and_places():
+def test_probabilities_go_to_points_branches_tree_and_places(monkeypatch):
+    monkeypatch.setattr(ghosts, "shipped_model", by_network)
     tree = bars(2)
     confidence = np.where(tree.branch_index() == 0, 0.9, 0.2)
     views = [picture(tree, view) for view in CARMS]
-    found = find_ghosts(Shown(tree, views, cells(tree, confidence)), by_network())
+    found = find_ghosts(Shown(tree, views, cells(tree, confidence)))
     assert found.branches == pytest.approx([0.1, 0.8])
     assert [len(told) for told in found.points] == [len(branch) for branch in tree.branches]
     assert found.points[1] == pytest.approx(np.full(len(tree.branches[1]), 0.8))

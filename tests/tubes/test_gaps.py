@@ -127,9 +127,7 @@ def test_ends_that_the_fit_has_turned_are_asked_again():
         points_mm=start.points(), confidence=np.ones(len(start.points())),
         radius_mm=start.radii(), spacing_mm=1.0, source="multi",
     )  # fmt: skip
-    given = TubeFit(
-        tree=start, centers=points, scatter_mm=0.0, contrast=(1.0, 1.0), progress=Progress()
-    )
+    given = TubeFit(tree=start, centers=points, contrast=(1.0, 1.0), progress=Progress())
     found = _fitted(given, views, Run(TubeOptions(), given.progress, None, None))
     assert len(found.tree.part_lengths_mm()) == 1
     assert cKDTree(found.tree.points()).query(LINE)[0].max() < 1.0
