@@ -34,7 +34,7 @@ _SHOWN = ("dsc", "cldice", "chamfer_mm", "cpu_seconds")
 _BLOCK = re.compile(r"(<!-- figures: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
-def overview(results: Path, before: str = "", method: str = "ours") -> str:
+def overview(results: Path, before: str = "") -> str:
     """One line per evaluated folder: what was given, mean and SD of the main measures, statuses.
 
     The line of a protocol without rows in ``results`` is that of the table ``before``.
@@ -47,7 +47,7 @@ def overview(results: Path, before: str = "", method: str = "ours") -> str:
         file = results / name.split("-")[0] / "cases.csv"
         rows = [
             row for row in (tables.read_case_rows(file) if file.is_file() else [])
-            if (row["protocol"], row["method"]) == (name, method)
+            if (row["protocol"], row["method"]) == (name, "ours")
         ]  # fmt: skip
         if not rows:
             lines += [old[given]] if given in old else []

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.config import RunOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.types import Volume
@@ -52,11 +51,11 @@ class PairTiming:
         return self.reconstruct_s / self.pair_s
 
 
-def time_pair(case: Case, options: RunOptions | None = None, repeats: int = 7) -> PairTiming:
+def time_pair(case: Case, repeats: int = 7) -> PairTiming:
     """Time the pair and the reconstruction of ``case`` in turns, after one untimed round."""
     from gcar_deploy.engine import Engine
 
-    engine = Engine(options=options)
+    engine = Engine()
     angiograms, grid = case.angiograms(), case.grid
     forward, back = projection_pair(case.truth, grid, case.scene_carms)
     stages: list[Any] = []

@@ -166,13 +166,3 @@ def training_pair(seed: int, index: int) -> tuple[Array, Array]:
     if turn[2]:
         channels, truth = channels.transpose(0, 2, 1), truth.transpose(0, 2, 1)
     return np.ascontiguousarray(channels), np.ascontiguousarray(truth)
-
-
-def picture_with_mask(made: GeneratedAngiogram) -> Array:
-    """(SIDE, 2 SIDE, 3) uint8: the picture, and beside it the truth: green, devices orange."""
-    grey = cv2.cvtColor(made.pixels, cv2.COLOR_GRAY2BGR)
-    drawn = grey.copy()
-    drawn[made.mask] = (0.5 * drawn[made.mask] + np.array([0, 100, 0])).astype(np.uint8)
-    drawn[made.unsure] = (0.7 * drawn[made.unsure] + np.array([70, 70, 0])).astype(np.uint8)
-    drawn[made.device] = (0.5 * drawn[made.device] + np.array([0, 60, 120])).astype(np.uint8)
-    return np.concatenate([grey, drawn], axis=1)

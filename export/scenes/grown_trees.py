@@ -43,7 +43,7 @@ def grown_tree(rng: np.random.Generator) -> SyntheticTree:
         Vessel(name=str(k), side="grown", points_mm=line - middle, radius_mm=wide)
         for k, (line, wide) in enumerate(drawn)
     )
-    return SyntheticTree(vessels=tuple(vessels), dominance="none")
+    return SyntheticTree(vessels=tuple(vessels))
 
 
 def _ways(rng: np.random.Generator) -> tuple[Points, Array]:

@@ -40,6 +40,8 @@ CENTRED_WITHIN_MM = 2.0
 LEAST_TREE = 0.03
 #: of a voxel that is vessel, or probability that it is, from which on it counts as vessel
 SHARE = 0.5
+#: samples along each edge of a voxel that is averaged over
+SAMPLES = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,20 +141,17 @@ class LabelVolume:
         left, right = (parts[0], parts[1]) if x[0] > x[1] else (parts[1], parts[0])
         return left, right
 
-    def on_grid(self, grid: Grid, samples: int = 3) -> Volume:
+    def on_grid(self, grid: Grid) -> Volume:
         """Area-averaged occupancy on another grid.
 
-        Each voxel is the mean of ``samples``^3 evenly spaced trilinear samples of this
-        volume (zero outside), which is separable: one small matrix per axis. Identical
-        grids are returned unchanged.
+        Each voxel is the mean of ``SAMPLES``^3 evenly spaced trilinear samples of this volume
+        (zero outside), or of more where samples would be further apart than its voxels. That
+        is separable: one small matrix per axis. Identical grids are returned unchanged.
 
         Parameters
         ----------
         grid : Grid
             The voxels wanted.
-        samples : int
-            Samples per voxel edge; raised where a voxel is so coarse that samples would
-            be further apart than this volume's voxels.
 
         Returns
         -------
@@ -163,7 +162,7 @@ class LabelVolume:
         out: Array = self.occupancy.astype(np.float64)
         ratio = grid.spacing_mm / self.grid.spacing_mm
         for axis in range(3):
-            count = max(samples, int(np.ceil(ratio[axis])))
+            count = max(SAMPLES, int(np.ceil(ratio[axis])))
             weights = _axis_weights(self.grid, grid, axis, count)
             out = np.moveaxis(np.tensordot(weights, out, axes=(1, axis)), 0, axis)
         return np.clip(out, 0, 1).astype(np.float32)

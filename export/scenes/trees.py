@@ -71,7 +71,6 @@ class SyntheticTree:
     """Vessels of one patient, centred on its bounding box."""
 
     vessels: tuple[Vessel, ...]
-    dominance: str
 
     def segments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (n, 3) starts, (n, 3) ends and (n,) radii of capsules that cover the lumen."""
@@ -147,7 +146,7 @@ def random_tree(rng: np.random.Generator, style: TreeStyle | None = None) -> Syn
         radius = v.radius_mm * (1 - style.taper * np.linspace(0, 1, len(v.radius_mm)))
         radius = texture_radius(rng, radius, floor, style.wall, style.thinnest_mm)
         finished.append(dataclasses.replace(v, points_mm=points, radius_mm=radius))
-    return _centred(SyntheticTree(tuple(finished), dominance))
+    return _centred(SyntheticTree(tuple(finished)))
 
 
 # -- vessels ------------------------------------------------------------------------------

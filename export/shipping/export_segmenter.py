@@ -132,9 +132,9 @@ class _CheckpointSession:
         return [told[OUTPUTS.index(name)].numpy() for name in outputs]
 
 
-def checkpoint_segmenter(checkpoint: Path, devices: Path | None = None) -> Segmenter:
-    """Open checkpoints as if they were a model, for looking at them."""
-    return Segmenter(cast(Session, _CheckpointSession(checkpoint, devices or shipped())))
+def checkpoint_segmenter(checkpoint: Path) -> Segmenter:
+    """Open a checkpoint as if it were a model, with the shipped network of lines."""
+    return Segmenter(cast(Session, _CheckpointSession(checkpoint, shipped())))
 
 
 def shipped() -> Path:

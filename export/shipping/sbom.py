@@ -22,9 +22,9 @@ _CLASSIFIER = "License :: OSI Approved :: "
 _EXTRA = re.compile(r"extra\s*==")
 
 
-def direct(pyproject: Path = ROOT / "pyproject.toml") -> dict[str, list[str]]:
+def direct() -> dict[str, list[str]]:
     """Distribution -> the parts of gcar that ask for it: ``runtime`` or names of extras."""
-    project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     found: dict[str, list[str]] = {}
     parts = {"runtime": project["dependencies"], **project["optional-dependencies"]}
     for part, requirements in parts.items():

@@ -65,7 +65,6 @@ class Row:
     protocol, arm, tree, level_mm : what was asked
     status, findings : what came out
     motion_mm : what was reported of the second view's motion, per view
-    across_mm : root mean square of the motion across the epipolar planes, its mean taken out
     shape_mm : Chamfer distance from the triangulated true tree, after rigid alignment
     first_mm, mean_mm : the same from the tree of view 1, and from the mean of both views' trees
     wrong, missed : share of found points far from the triangulated tree, and the reverse
@@ -80,7 +79,6 @@ class Row:
     status: str
     findings: tuple[str, ...] = ()
     motion_mm: tuple[float, ...] = ()
-    across_mm: float = 0.0
     shape_mm: float | None = None
     first_mm: float | None = None
     mean_mm: float | None = None
@@ -129,11 +127,7 @@ def one(protocol: str, number: int, level_mm: float, arm: str, engine: Engine) -
     """Simulate and reconstruct one pair."""
     pair = make_pair(protocol, number, level_mm, arm)
     first, second = pair.lines
-    gaps = (second - first) @ plane_normal(*pair.carms)
-    row = Row(
-        protocol=protocol, arm=arm, tree=number, level_mm=level_mm, status="refused",
-        across_mm=float(gaps.std()),
-    )  # fmt: skip
+    row = Row(protocol=protocol, arm=arm, tree=number, level_mm=level_mm, status="refused")
     try:
         with _without_motion() if arm == "rigid" else contextlib.nullcontext():
             result = engine.reconstruct(list(pair.pictures), pair.grid)

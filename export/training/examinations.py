@@ -134,7 +134,7 @@ def examination(
     for _ in range(SHRINKS):
         field = _field(tree)
         seen = [focused(carm, field) for carm in carms]
-        many = _points(tree, seen, field, h, 0.2 if thin else 0.5)
+        many = _points(tree, seen, field, h)
         if many < 0.75 * MAX_POINTS:
             return Examination(tree, seen, h, field.middle_mm, field.radius_mm, regime, thin)
         tree = _part(rng, tree, 0.9 * field.radius_mm * (0.75 * MAX_POINTS / many) ** 0.4, False)
@@ -168,7 +168,7 @@ def _field(tree: Capsules) -> Field:
     return Field(middle, float(np.linalg.norm(ends - middle, axis=1).max()) + 4.0)
 
 
-def _points(tree: Capsules, carms: Sequence[CArm], field: Field, h: float, least: float) -> int:
+def _points(tree: Capsules, carms: Sequence[CArm], field: Field, h: float) -> int:
     """Count the hull's points, from pictures as coarse as the lattice."""
     views = []
     for carm in carms:
