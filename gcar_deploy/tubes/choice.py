@@ -144,7 +144,10 @@ def reinstated(
     targets : one per view
     left : per view (rows, cols), path that the kept pieces leave unexplained, mm
     """
-    tubes = dataclasses.replace(tubes_of(tree), log_radius=np.log(start_radius))
+    tubes = tubes_of(tree)
+    # The points know no stenosis: a narrow vessel shows too small a share of so wide a path.
+    radius = np.minimum(start_radius, radius_alone(tubes, targets))
+    tubes = dataclasses.replace(tubes, log_radius=np.log(radius))
     dropped = pieces.share < MIN_SHARE
     count = len(pieces.share)
     found = []

@@ -1,5 +1,6 @@
 """Which pieces stay: the pictures' wish against a tree in parts."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -121,3 +122,33 @@ def test_near_ties_are_told_whichever_way_they_fell(monkeypatch):
         assert abs(branch.arc_mm[gap.argmin()] - 0.5 * branch.length_mm) < 2.0
     monkeypatch.setattr(choice, "TRUSTED_SHARE", 0.0)  # what is trusted is no tie
     assert not choice.weigh_pieces(tree, tubes, tree.radii(), targets).tie.any()
+
+
+def narrowed(tree, branch, to):
+    """The same tree, one branch as narrow as ``to`` along its middle."""
+    branches = list(tree.branches)
+    own = branches[branch]
+    middle = np.abs(own.arc_mm / own.length_mm - 0.5) < 0.4
+    branches[branch] = dataclasses.replace(own, radius_mm=np.where(middle, to, own.radius_mm))
+    return dataclasses.replace(tree, branches=tuple(branches))
+
+
+def test_a_stenosed_branch_comes_back_that_the_points_hold_to_be_wide():
+    tree = fork()
+    shown = narrowed(tree, 2, 0.25)
+    targets = make_targets(seen(shown, two_views()), 0.0, TubeOptions())
+    tubes = tubes_of(tree)
+    pieces = choice.weigh_pieces(tree, tubes, tree.radii(), targets)
+    dropped = dataclasses.replace(pieces, share=np.array([1.0, 1.0, 0.0]))
+    rest = dataclasses.replace(shown, branches=shown.branches[:2])
+    left = [
+        target.path_mm - other.path_mm
+        for target, other in zip(
+            targets, make_targets(seen(rest, two_views()), 0.0, TubeOptions()), strict=True
+        )
+    ]
+    back = choice.reinstated(tree, dropped, tree.radii(), targets, left)
+    assert back.share[2] == 1.0
+    # What no picture shows does not come back, however narrow it could be.
+    nothing = [np.zeros_like(one) for one in left]
+    assert choice.reinstated(tree, dropped, tree.radii(), targets, nothing).share[2] == 0.0
