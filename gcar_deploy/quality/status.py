@@ -263,19 +263,18 @@ def check_explained(
 
 def _sentence(findings: Sequence[str], tree: Tree, count: int) -> str:
     if not findings:
-        return f"All {count} views are explained by one tree{_pieces(tree)}. {_CHECKED} {_UNSEEN}"
+        return f"All {count} views are explained by {_pieces(tree)}. {_CHECKED} {_UNSEEN}"
     more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
     text = findings[0][0].upper() + findings[0][1:] + more
     return text if text.endswith("?") else f"{text}."
 
 
 def _pieces(tree: Tree) -> str:
-    """Tell disconnected pieces; nothing of a tree that hangs together."""
-    lengths = part_lengths_mm(tree)
-    if len(lengths) < 2:
-        return ""
-    told = ", ".join(f"{length:.0f}" for length in lengths)
-    return f", in {len(lengths)} disconnected pieces of {told} mm"
+    """Name one tree, or the separate pieces of one that does not hang together."""
+    *others, last = (f"{length:.0f}" for length in part_lengths_mm(tree) or (0.0,))
+    if not others:
+        return "one tree"
+    return f"{len(others) + 1} separate pieces of {', '.join(others)} and {last} mm"
 
 
 def part_lengths_mm(tree: Tree) -> tuple[float, ...]:

@@ -173,5 +173,7 @@ def test_ok_says_what_was_checked_what_was_not_and_how_many_pieces(case):
     assert len(lengths) > 1 and sum(lengths) == pytest.approx(tree.length_mm)
     assert lengths == tuple(sorted(lengths, reverse=True))
     told = assess(torn, views, lumen, [], 0.01, OPTIONS)
-    assert told.status == "ok" and f"{len(lengths)} disconnected pieces of" in told.sentence
+    *longer, shortest = (f"{length:.0f}" for length in lengths)
+    said = f"by {len(lengths)} separate pieces of {', '.join(longer)} and {shortest} mm."
+    assert told.status == "ok" and said in told.sentence and "one tree" not in told.sentence
     assert part_lengths_mm(empty_tree()) == ()
