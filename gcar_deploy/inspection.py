@@ -27,7 +27,7 @@ from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, load_predictor, quick_tree, seen_by_all
-from gcar_deploy.quality import check_candidates, check_views
+from gcar_deploy.quality import check_candidates, check_found, check_views
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.tree import Tree
 
@@ -120,6 +120,7 @@ def inspect_files(
             view = extract_vessels(angiogram, options.imaging, segmenter)
             found.views[k]["vessel_share"] = float(view.mask.mean())
             views.append(view)
+        check_found(views)
         found.warnings += _registered(found, own, views, frame.grid(grid), asked)
     except GcarError as error:
         found.error = error

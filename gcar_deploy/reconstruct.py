@@ -31,7 +31,16 @@ from gcar_deploy.measure import (
 )
 from gcar_deploy.pose import landmark_pixels, marked_places, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
-from gcar_deploy.quality import Part, Remark, check_candidates, check_tree, check_views, judge
+from gcar_deploy.quality import (
+    Part,
+    Remark,
+    check_candidates,
+    check_found,
+    check_length,
+    check_tree,
+    check_views,
+    judge,
+)
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.steps import OnStep, Step
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
@@ -119,6 +128,7 @@ def _reconstructed(
         angiograms = with_polarity(angiograms)
         vessels = find_vessels(angiograms, options.imaging, segmenter, watch, report)
         keep(vessels)
+        check_found(vessels.views)
     with watch.stage("pose"):
         placed = register(angiograms, vessels.views, options, tree_of, watch.check)
         keep(placed)
@@ -146,6 +156,7 @@ def _reconstructed(
         if options.deleted_mm and not refined.tree.branches:
             raise RefusedError("every branch was deleted: nothing is left")
         check_tree(refined.tree, options.quality)
+        check_length(refined.tree, options.quality)
     # Nothing but the result asks for the voxels: they are made beside what follows.
     voxels = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
     with waited_for(voxels) as made:

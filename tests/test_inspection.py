@@ -12,7 +12,13 @@ import pytest
 from click.testing import CliRunner
 
 from gcar_deploy.cli.main import gcar
-from gcar_deploy.config import ImagingOptions, PredictOptions, RefineOptions, RunOptions
+from gcar_deploy.config import (
+    ImagingOptions,
+    PredictOptions,
+    QualityOptions,
+    RefineOptions,
+    RunOptions,
+)
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, RefusedError
 from gcar_deploy.geometry.carm import CArm
@@ -20,6 +26,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity, Scene, View, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.inspection import inspect_files, volume_coverage
+from gcar_deploy.quality import too_much
 from gcar_deploy.selftest import tiny_case
 
 
@@ -100,6 +107,31 @@ def test_says_what_run_would_refuse_with_its_code(case, change, code):
     args = ["validate", *map(str, pictures), "--geom", str(geom)]
     result = runner.invoke(gcar, [*args, "--json"])
     assert '"would": "refuse"' in result.output
+
+
+def test_too_much_vessel_is_refused_before_the_views_are_placed(case, monkeypatch):
+    """By run and validate in the same words; the pictures stand for some with ribs."""
+    scene = json.loads((case / "geom.json").read_text())
+    for k, view in enumerate(scene["views"], start=1):
+        path = cv2.imread(str(case / f"view{k}.png"), -1) * view["intensity"]["mm_per_count"]
+        cv2.imwrite(str(case / f"view{k}.png"), (180 * np.exp(-0.15 * path)).astype(np.uint8))
+        view["intensity"] = {"kind": "raw"}
+    (case / "geom.json").write_text(json.dumps(scene))
+    monkeypatch.setattr(too_much, "MOST_ML", 0.1)
+    monkeypatch.setattr(too_much, "MOST_LINE_MM", 50.0)
+    options = RunOptions(imaging=ImagingOptions(segmenter="classic"))
+    steps = []
+    with pytest.raises(RefusedError, match="than any heart has") as refused:
+        engine = Engine(threads=1, options=options)
+        engine.reconstruct(*files(case), on_step=lambda step: steps.append(type(step).__name__))
+    assert steps[-1] == "Vessels"
+    assert str(inspect_files(*files(case), options=options).error) == str(refused.value)
+
+
+def test_run_refuses_a_tree_longer_than_any(case):
+    options = RunOptions(quality=QualityOptions(max_length_mm=60.0))
+    with pytest.raises(RefusedError, match="more than any coronary tree has"):
+        Engine(threads=1, options=options).reconstruct(*files(case))
 
 
 def test_a_volume_beside_the_tree_is_refused_in_the_words_of_run(case):

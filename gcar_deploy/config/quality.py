@@ -98,3 +98,5 @@ class QualityOptions:
     good_scale: Share = 0.02
     #: less tree than this is not a coronary tree
     min_length_mm: Length = 20.0
+    #: and more is none: generated trees of one side with all their twigs reach 1150 mm
+    max_length_mm: Length = 1500.0

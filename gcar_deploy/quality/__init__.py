@@ -30,6 +30,7 @@ from gcar_deploy.quality.status import (
     part_lengths_mm,
     unexplained,
 )
+from gcar_deploy.quality.too_much import check_found, check_length
 
 __all__ = [
     "FIGURES",
@@ -45,6 +46,8 @@ __all__ = [
     "check_candidates",
     "check_consistency",
     "check_explained",
+    "check_found",
+    "check_length",
     "check_motion",
     "check_order",
     "check_poses",

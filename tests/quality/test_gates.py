@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from gcar_deploy.config import QualityOptions
@@ -20,6 +21,7 @@ from gcar_deploy.quality.gates import (
     kind_of,
     with_hint,
 )
+from gcar_deploy.quality.too_much import MOST_LINE_MM, MOST_ML, check_found, check_length
 from gcar_deploy.tree.tree import empty_tree
 
 OPTIONS = QualityOptions()
@@ -131,3 +133,46 @@ def test_a_large_correction_between_the_runs_is_degraded(case):
     for correction in ((limit + 0.1, 0.0), (0.0, turn + 0.1)):
         (finding,) = check_poses(views, [(0.0, 0.0), correction], OPTIONS)
         assert "view 2 had to be moved" in finding
+
+
+def filled(view, ml, line_mm, kind="raw"):
+    """Return a view with so much vessel, in rows of a comb."""
+    pixel = view.carm.pixel_at_isocenter_mm
+    row = np.zeros(view.skeleton.shape, bool)
+    row[::2] = True
+    row &= np.cumsum(row.reshape(-1)).reshape(row.shape) <= line_mm / pixel
+    path = np.where(row, ml * 1000 / (row.sum() * pixel**2), 0).astype(np.float32)
+    return dataclasses.replace(
+        view,
+        path_mm=path,
+        skeleton=row,
+        kind=kind,
+        path_error=0.0 if kind == "path_length" else 0.2,
+    )
+
+
+@pytest.mark.req("REQ-13")
+def test_more_vessel_than_a_heart_has(case):
+    first, second = case[1]
+    much, long = 1.2 * MOST_ML, 1.2 * MOST_LINE_MM
+
+    def pair(ml, mm, *kinds):
+        return [filled(v, ml, mm, k) for v, k in zip((first, second), kinds, strict=True)]
+
+    with pytest.raises(RefusedError, match=r"any heart has.*view 2: 12 ml, 8.. mm.*give masks"):
+        check_found(pair(much, long, "raw", "raw"))
+    # Wide arteries are short, thin lines hold little, and what is given was not mistaken here.
+    check_found(pair(much, 0.8 * MOST_LINE_MM, "raw", "raw"))
+    check_found(pair(0.8 * MOST_ML, long, "raw", "raw"))
+    check_found(pair(much, long, "raw", "mask"))
+    check_found(pair(much, long, "path_length", "path_length"))
+    check_found([filled(first, much, long), filled(second, 3.0, 400.0)])
+
+
+@pytest.mark.req("REQ-13")
+def test_more_tree_than_a_heart_has(case):
+    tree = case[2]
+    check_length(tree, OPTIONS)
+    less = dataclasses.replace(OPTIONS, max_length_mm=0.9 * tree.length_mm)
+    with pytest.raises(RefusedError, match=r"more than any coronary tree has.*give masks"):
+        check_length(tree, less)
