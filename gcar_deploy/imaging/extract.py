@@ -27,6 +27,7 @@ from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.imaging.polarity import is_dark, with_polarity
 from gcar_deploy.imaging.shadow_devices import without_devices
 from gcar_deploy.imaging.standing import what_came, without_standing
+from gcar_deploy.imaging.thin_mask import refuse_thin
 from gcar_deploy.imaging.widths import MASK_ERROR
 from gcar_deploy.types import Image, Mask
 
@@ -99,6 +100,7 @@ def _found(
     if angiogram.intensity.kind == "mask":
         return _from_mask(angiogram)
     if angiogram.mask is not None:
+        refuse_thin(angiogram, angiogram.mask)
         return _from_grey(angiogram, _under(_grey_values(angiogram), "display"), None)
     if options.segmenter == "net":
         segmenter = _needed(segmenter)
@@ -236,6 +238,7 @@ def _from_mask(angiogram: Angiogram) -> VesselImage:
         mask &= angiogram.mask
     if mask.mean() > _FULL:
         raise _nothing(angiogram, "nearly every pixel is full")
+    refuse_thin(angiogram, mask)
     return _from_drawn(dataclasses.replace(angiogram, valid=valid), mask)
 
 

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import cv2
 import numpy as np
 import pytest
 
+from gcar_deploy.config import ImagingOptions
+from gcar_deploy.errors import RefusedError
+from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.mask_path import mask_path
-from tests.imaging.phantoms import PIXEL_MM, tube_paths
+from gcar_deploy.imaging.skeleton import skeletonize
+from tests.imaging.phantoms import PIXEL_MM, angiogram, raw_picture, tube_paths
 
 
 def ball(size: int, middle: tuple[float, float], radius_mm: float, pixel_mm: float):
@@ -48,6 +56,32 @@ def test_a_line_one_pixel_wide_is_a_vessel() -> None:
     found = mask_path(mask, 0.3)
     assert (found[mask] > 0.2).all() and (found[mask] < 0.5).all()
     assert (found[~mask] == 0).all()
+
+
+@pytest.mark.parametrize("corners", [False, True])
+@pytest.mark.parametrize("kind", ["mask", "raw"])
+def test_a_thinned_mask_is_refused(kind: str, corners: bool) -> None:
+    """Lines that touch at corners alone, or run round every corner."""
+    whole = tube_paths() > 0.5
+    thin = skeletonize(whole)
+    if corners:
+        thin |= np.roll(thin, 1, 0) & (np.roll(thin, 1, 1) | np.roll(thin, -1, 1))
+    assert thin.sum() < 0.25 * whole.sum()
+
+    def view(mask: np.ndarray, pixel_mm: float = PIXEL_MM) -> VesselImage:
+        if kind == "mask":
+            given = angiogram(mask, "mask", pixel_mm=pixel_mm)
+        else:
+            given = dataclasses.replace(
+                angiogram(raw_picture(tube_paths(pixel_mm=pixel_mm)), pixel_mm=pixel_mm), mask=mask
+            )
+        return extract_vessels(given, ImagingOptions(segmenter="classic"))
+
+    with pytest.raises(RefusedError, match=r"view 2: the mask's lines are one pixel wide"):
+        view(thin)
+    view(whole)
+    assert view(cv2.dilate(thin.astype(np.uint8), np.ones((2, 2))) > 0).mask.any()
+    assert view(thin, pixel_mm=1.0).mask.any()
 
 
 def test_an_empty_mask_has_no_path() -> None:
