@@ -243,7 +243,7 @@ class Reconstruction:
         }
         out: dict[str, Any] = plain(body, "", reasons)
         for path in reasons:
-            if path.startswith("/tree/branches/") and path.endswith(_LUMEN):
+            if path.startswith("/tree/branches/") and path.endswith((*_LUMEN, "/lesions")):
                 reasons[path] = "the branch is too short to state a stenosis"
             if "/picture/frame/" in path:
                 reasons[path] = (
@@ -403,6 +403,8 @@ def _branch(
         "proximal_reference_mm": lumen.proximal_reference_mm,
         "distal_reference_mm": lumen.distal_reference_mm,
         "plaque_free_mm": lumen.plaque_free_mm,
+        "lesions": lumen.lesions and [dataclasses.asdict(one) for one in lumen.lesions],
+        **({} if lumen.narrows_to_mm is None else {"narrows_to_mm": lumen.narrows_to_mm}),
     }
 
 

@@ -13,7 +13,8 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.flow import Assumption, PressureDrop, model_0d, pressure_drop
 from gcar_deploy.measure import Sections
-from gcar_deploy.measure.lumen import LESION_SHARE, tree_lumens
+from gcar_deploy.measure.lesions import LESION_SHARE
+from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.result import Result
 from gcar_deploy.tree.tree import Tree
 from gcar_export.scenes.stenosis_cases import (

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.grid import Grid
-from gcar_deploy.measure.lumen import LESION_SHARE, BranchLumen
+from gcar_deploy.measure.lesions import LESION_SHARE
+from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.result import Result
 from gcar_deploy.tree.tree import along
 from gcar_export.scenes.lumen_vessels import LumenCase, ivus_shapes, lumen_case, taken

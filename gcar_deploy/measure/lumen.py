@@ -10,15 +10,20 @@ import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.measure.borders import between_borders
+from gcar_deploy.measure.lesions import (
+    BORDER_SHARE,
+    LESION_SHARE,
+    Lesion,
+    going_on_mm,
+    lesion_at,
+    narrowest,
+    recovers,
+)
 from gcar_deploy.measure.reference import reference_lines
 from gcar_deploy.measure.sections import Sections, sections_of_radii
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Array, Scalars
 
-#: a stretch this much narrower than its reference (share) counts as lesion.
-LESION_SHARE = 0.25
-#: a lesion ends where the lumen is this share of its reference again; narrower is plaque
-BORDER_SHARE = 0.9
 #: stretches this close to an end (in radii) are left out: the tube ends or widens there.
 END_RADII = 1.5
 #: the lumen at an end is the widest within this, mm
@@ -48,6 +53,9 @@ class BranchLumen:
     lesion_mm : proximal and distal border of that lesion, distance from the inlet
     proximal_reference_mm, distal_reference_mm : reference diameter at the borders
     plaque_free_mm : length of vessel that is no narrower than its reference by a tenth
+    lesions : all of the branch, the gravest first: the one that the figures above tell of
+    narrows_to_mm : least diameter where the branch tapers or steps down by more than a lesion and
+        is not wider again beyond; no lesion, and None where it does not
     """
 
     healthy_mm: Scalars
@@ -65,6 +73,8 @@ class BranchLumen:
     proximal_reference_mm: float | None = None
     distal_reference_mm: float | None = None
     plaque_free_mm: float | None = None
+    lesions: tuple[Lesion, ...] | None = None
+    narrows_to_mm: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,10 +105,11 @@ def tree_lumens(
     clear = [_clear(tree, k, own) for k, own in enumerate(sections)]
     lines = reference_lines(tree, sections, clear)
     marked = marked or {}
+    further = going_on_mm(tree, sections, clear)
     return tuple(
-        _lumen(branch.arc_mm, own, (line, use), marked.get(k))
-        for k, (branch, own, line, use) in enumerate(
-            zip(tree.branches, sections, lines, clear, strict=True)
+        _lumen(branch.arc_mm, own, (line, use, beyond), marked.get(k))
+        for k, (branch, own, line, use, beyond) in enumerate(
+            zip(tree.branches, sections, lines, clear, further, strict=True)
         )
     )
 
@@ -117,10 +128,10 @@ def _clear(tree: Tree, k: int, own: Sections) -> Array:
 def _lumen(
     arc_mm: Scalars,
     own: Sections,
-    told: tuple[Scalars, Array],
+    told: tuple[Scalars, Array, float],
     marked: tuple[float, float] | None,
 ) -> BranchLumen:
-    line, clear = told
+    line, clear, beyond = told
     searched = clear
     if marked is not None:
         line = between_borders(own, line, marked)
@@ -135,10 +146,22 @@ def _lumen(
     share = own.diameter_mm / line
     # The most severe narrowing, not the narrowest point, which may just be the thin far end.
     k = int(np.argmin(np.where(searched, share, np.inf)))
-    least = float(min(share[k], 1.0))
-    first, last = _borders(share, k, least)
+    again = recovers(own, line, clear, beyond)
+    if marked is None and share[k] < 1 - LESION_SHARE and not again[k]:
+        # What a taper ends in is no stenosis: the most severe narrowing of the others is.
+        known = searched & (again | (share >= 1))
+        if not known.any():
+            known = searched & (share == share[searched].max())
+        k = int(np.argmin(np.where(known, share, np.inf)))
+    spots = narrowest(share, searched & again)
     if marked is not None:
         first, last = np.flatnonzero(searched)[[0, -1]]
+        spots = [(k, int(first), int(last))]
+    for_good = clear & ~again & (share < 1 - LESION_SHARE)
+    for _, first, last in spots:
+        for_good[first : last + 1] = False
+    k, first, last = spots[0] if spots else (k, k, k)
+    least = float(min(share[k], 1.0))
     spans = np.gradient(own.arc_mm)
     return BranchLumen(
         healthy_mm=healthy,
@@ -156,18 +179,9 @@ def _lumen(
         proximal_reference_mm=float(line[first]) if last > first else None,
         distal_reference_mm=float(line[last]) if last > first else None,
         plaque_free_mm=float(spans[clear & (share >= BORDER_SHARE)].sum()),
+        lesions=tuple(lesion_at(own, line, *spot) for spot in spots),
+        narrows_to_mm=float(own.diameter_mm[for_good].min()) if for_good.any() else None,
     )
-
-
-def _borders(share: Scalars, k: int, least: float) -> tuple[int, int]:
-    """Sections at which the lesion round section ``k`` begins and ends."""
-    first = last = k
-    if least < 1 - LESION_SHARE:
-        while first > 0 and share[first] < BORDER_SHARE:
-            first -= 1
-        while last < len(share) - 1 and share[last] < BORDER_SHARE:
-            last += 1
-    return first, last
 
 
 def bifurcation_angles(tree: Tree) -> tuple[BifurcationAngle, ...]:

@@ -192,7 +192,7 @@ def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
         f"{2 * row['mean_radius_mm']:.2f}",
         _number(row["minimal_diameter_mm"]),
         _number(row["reference_diameter_mm"]),
-        "-" if row["stenosis_percent"] is None else f"{row['stenosis_percent']:.0f} %",
+        _narrowing(row),
         "-" if row["lesion_length_mm"] is None else f"{row['lesion_length_mm']:.1f}",
         _number(row["mean_sigma_mm"]),
         _share(row["ghost_probability"]),
@@ -203,6 +203,16 @@ def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
         f'<tr data-branch="{row["branch"]}"><td class="swatch"></td>{columns}'
         '<td class="short">-</td></tr>'
     )
+
+
+def _narrowing(row: Mapping[str, Any]) -> str:
+    """Say the stenosis, that of further lesions, and what the branch narrows to without one."""
+    if row["stenosis_percent"] is None:
+        return "-"
+    further = [one["stenosis_percent"] for one in (row.get("lesions") or ())[1:]]
+    told = ", ".join(f"{percent:.0f} %" for percent in (row["stenosis_percent"], *further))
+    least = row.get("narrows_to_mm")
+    return told if least is None else f"{told}; narrows to {least:.2f} mm without recovery"
 
 
 def pressure_rows(summary: Mapping[str, Any]) -> str:

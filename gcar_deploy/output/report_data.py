@@ -23,8 +23,9 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
     -------
     ``branches``: per branch its number, points (mm LPS), arc, radius, reference diameter's half
     (None near the ends), sigma, probability of a ghost, per view the place in the picture and the
-    residual (mm, None outside), colour, least diameter and lesion; ``views``: directions of the
-    views, then the best further one; ``longest``: the branch to begin with
+    residual (mm, None outside), colour, least diameter, lesion, further ones, and what it narrows
+    to where that is none; ``views``: directions of the views, then the best further one;
+    ``longest``: the branch to begin with
     """
     points = len(result.tree.points())
     stride = max(1, -(-points * (8 + 3 * len(result.views)) // _NUMBERS))
@@ -72,6 +73,8 @@ def _branch(result: Reconstruction, k: int, stride: int) -> dict[str, Any]:
         else [round(lumen.minimal_at_mm, 2), round(lumen.minimal_diameter_mm or 0.0, 2)],
         "stenosis": _one(lumen.stenosis_percent),
         "lesion": None if lumen.lesion_mm is None else np.round(lumen.lesion_mm, 1).tolist(),
+        "further": [np.round(one.lesion_mm, 1).tolist() for one in (lumen.lesions or ())[1:]],
+        "narrows": _one(lumen.narrows_to_mm),
     }
 
 

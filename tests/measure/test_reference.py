@@ -99,3 +99,79 @@ def test_a_mark_beside_every_vessel_is_said():
     mark = LesionBorders(view=1, proximal=(2.0, 2.0), distal=(4.0, 2.0))
     marked, missed = marked_lesions(tree, sections_of_radii(tree), two_views(), (mark,))
     assert not marked and "lesion 1: no branch passes" in missed[0]
+
+
+def straight(knots, diameters, sides=(), rough=0.0):
+    """A vessel with such diameters at such arcs, and those that follow at its end."""
+    z = np.arange(0, knots[-1] + 0.1, 0.25)
+    wall = 1 + rough * np.sin(9 * z)
+    made = [branch(np.stack([0 * z, 0 * z, z], 1), 0.5 * np.interp(z, knots, diameters) * wall)]
+    nodes, s = [[0, 0, 0.0], [0, 0, z[-1]]], np.arange(0, 25.1, 0.5)
+    for k, diameter in enumerate(sides):
+        line = np.stack([(k - 0.5) * s, 0 * s, z[-1] + s], 1)
+        made.append(branch(line, np.full(len(s), diameter / 2), 1, k + 2))
+        nodes.append(line[-1])
+    return tree_lumens(Tree(nodes_mm=np.array(nodes), branches=tuple(made)))[0]
+
+
+def test_two_lesions_in_series_are_both_told():
+    lumen = straight(
+        (0, 10, 13, 16, 22, 25, 28, 50), (3, 3, 1.3, 3, 3, 1.1, 3, 3), rough=0.01
+    )  # fmt: skip
+    grave, second = lumen.lesions
+    assert grave.minimal_at_mm == pytest.approx(25, abs=0.5)
+    assert second.minimal_at_mm == pytest.approx(13, abs=0.5)
+    assert (grave.minimal_diameter_mm, second.minimal_diameter_mm) == pytest.approx(
+        (1.1, 1.3), abs=0.05
+    )
+    assert grave.stenosis_percent == lumen.stenosis_percent
+    assert grave.lesion_mm == lumen.lesion_mm
+    assert second.lesion_mm == pytest.approx((10.5, 15.5), abs=1)
+
+
+def test_between_two_lesions_the_vessel_comes_half_of_the_way_back():
+    arcs = (0, 10, 13, 16, 19, 22, 50)
+    (one,) = straight(arcs, (3, 3, 1.2, 1.9, 1.2, 3, 3)).lesions
+    assert one.lesion_mm[0] < 12 and one.lesion_mm[1] > 20
+    first, second = sorted(
+        straight(arcs, (3, 3, 1.2, 2.4, 1.2, 3, 3)).lesions, key=lambda one: one.minimal_at_mm
+    )
+    # They touch where the vessel is widest.
+    assert first.lesion_mm[1] == second.lesion_mm[0] == pytest.approx(16, abs=0.5)
+
+
+@pytest.mark.parametrize("sides", [(), (1.3, 1.2)])
+@pytest.mark.parametrize(
+    ("knots", "diameters"),
+    [((0, 22, 23, 40), (3.6, 3.6, 1.8, 1.5)), ((0, 24, 40), (3.6, 3.6, 1.5))],
+    ids=["step", "taper"],
+)
+def test_what_narrows_for_good_is_no_lesion(knots, diameters, sides):
+    lumen = straight(knots, diameters, sides, rough=0.02)
+    assert lumen.lesions == () and lumen.lesion_mm is None and lumen.lesion_length_mm == 0
+    assert lumen.stenosis_percent < 15
+    assert lumen.narrows_to_mm == pytest.approx(1.6, abs=0.2)
+
+
+def test_a_lesion_above_a_step_is_told_alone():
+    lumen = straight((0, 8, 11, 14, 28, 29, 45), (3.6, 3.6, 1.7, 3.6, 3.6, 1.6, 1.4))
+    (lesion,) = lumen.lesions
+    assert lesion.minimal_at_mm == pytest.approx(11, abs=0.5)
+    assert lumen.minimal_at_mm == lesion.minimal_at_mm
+    assert lumen.stenosis_percent == pytest.approx(53, abs=5)
+    assert lumen.narrows_to_mm == pytest.approx(1.4, abs=0.1)
+
+
+def test_a_lesion_at_the_end_recovers_in_the_branches_that_follow():
+    lumen = straight((0, 24, 28, 30), (3, 3, 1.2, 1.2), sides=(2.4, 2.1))
+    (lesion,) = lumen.lesions
+    assert lesion.stenosis_percent == pytest.approx(60, abs=5)
+    assert lumen.narrows_to_mm is None
+    assert straight((0, 24, 28, 30), (3, 3, 1.2, 1.2)).lesions == ()
+
+
+def test_a_lesion_before_a_vessel_that_is_small_all_along_is_told():
+    lumen = straight((0, 30, 32, 34, 50), (3.4, 3.4, 1.0, 1.7, 1.5))
+    (lesion,) = lumen.lesions
+    assert lesion.minimal_at_mm == pytest.approx(32, abs=0.5)
+    assert lumen.stenosis_percent > 35 and lumen.minimal_diameter_mm == pytest.approx(1, abs=0.1)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import json
 import zipfile
+from importlib import resources
 
 import numpy as np
 import pytest
 
 from gcar_deploy.gaussians.gaussians import Gaussians
+from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.report import _jpeg, report_html
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.tables import centerline_csv, centerline_vtp, gaussians_npz, gaussians_ply
@@ -221,6 +224,35 @@ def test_lumen_figures_are_in_the_summary_and_in_the_vtp(result, tmp_path):
         ("ReferenceDiameter", "reference_diameter_mm"), ("LesionLength", "lesion_length_mm"),
     ):  # fmt: skip
         assert vtk_to_numpy(cells.GetArray(name))[0] == pytest.approx(row[key])
+
+
+def test_every_lesion_is_told_and_what_narrows_for_good_beside_them(result):
+    jsonschema = pytest.importorskip("jsonschema")
+    s = np.linspace(0.0, 60.0, 121)
+    radius = np.interp(
+        s,
+        (0, 8, 11, 14, 20, 23, 26, 40, 41, 60),
+        (1.8, 1.8, 0.7, 1.8, 1.8, 0.9, 1.8, 1.8, 0.8, 0.7),
+    )
+    line = Branch(
+        points_mm=np.stack([s, 0 * s, 0 * s], axis=1), radius_mm=radius,
+        sigma_mm=np.full(121, 0.1), confidence=np.ones(121), start=0, end=1,
+    )  # fmt: skip
+    told = with_tree(result, Tree(nodes_mm=line.points_mm[[0, -1]], branches=(line,)))
+    summary = told.summary()
+    schema = resources.files("gcar_deploy.output").joinpath("result.schema.json").read_text()
+    jsonschema.validate(summary, json.loads(schema))
+    (row,) = summary["tree"]["branches"]
+    first, second = row["lesions"]
+    assert (first["minimal_at_mm"], second["minimal_at_mm"]) == pytest.approx((11, 23), abs=0.5)
+    for key in ("minimal_diameter_mm", "minimal_at_mm", "stenosis_percent", "lesion_mm"):
+        assert first[key] == row[key]
+    assert row["narrows_to_mm"] == pytest.approx(1.4, abs=0.1)
+    page = render_files(told)["report.html"].decode("utf-8")
+    share = f"{first['stenosis_percent']:.0f} %, {second['stenosis_percent']:.0f} %"
+    assert f"<td>{share}; narrows to {row['narrows_to_mm']:.2f} mm without recovery</td>" in page
+    (branch,) = scene_data(told)["branches"]
+    assert branch["further"] == [pytest.approx(second["lesion_mm"], abs=0.06)]
 
 
 def test_a_fork_tells_its_angles_and_a_short_branch_why_it_says_nothing(result):

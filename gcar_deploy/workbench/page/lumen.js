@@ -15,12 +15,19 @@ const SLIGHT = 20, FEW = 3;
 const reference = row => [fixed(row.reference_diameter_mm, 2),
   (row.proximal_reference_mm ?? null) === null ? "" : el("small", { class: "ends" }, `${fixed(row.proximal_reference_mm, 2)}, ${fixed(row.distal_reference_mm, 2)}`)];
 
+/** Further lesions of a branch, and what it narrows to where that is no lesion. */
+const besides = row => {
+  const told = (row.lesions ?? []).slice(1).map(one => `${Math.round(one.stenosis_percent)} at ${one.minimal_at_mm.toFixed(0)} mm`);
+  if (row.narrows_to_mm) told.push(`narrows to ${row.narrows_to_mm.toFixed(1)} mm`);
+  return told.length ? el("small", { class: "besides", title: "further lesions, mm from the branch's inlet; narrowing without recovery is none" }, ` ${told.join(", ")}`) : "";
+};
+
 /** Fill the table, the most severe narrowing first; erase is called with a branch to delete. */
 export function table(store, erase) {
   const branches = [...store.result.scene.branches].sort((a, b) => (b.stenosis ?? -1) - (a.stenosis ?? -1) || a.branch - b.branch);
   const rows = branches.map((branch, rank) => {
     const { row } = branch, percent = row.stenosis_percent;
-    const cells = [percent === null ? "\u2013" : `${Math.round(percent)}`, percent === null ? "\u2013" : `${Math.round(area(percent))}`,
+    const cells = [percent === null ? "\u2013" : [`${Math.round(percent)}`, besides(row)], percent === null ? "\u2013" : `${Math.round(area(percent))}`,
       fixed(row.minimal_diameter_mm, 2), reference(row), fixed(row.lesion_length_mm || null, 1),
       row.minimal_at_mm === null || branch.from_ostium === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
       row.ghost_probability === null ? "\u2013" : `${Math.round(100 * row.ghost_probability)}`];
@@ -109,8 +116,8 @@ export class Curve {
     this.frame = { s: px => (px - left) / (right - left) * length };
     this.axes(ctx, { from: from(parts[0].branch), left, right, top, bottom, most, length, x, y });
     for (const { branch, start } of parts) {
-      if (branch.lesion) {
-        const [begin, end] = branch.lesion.map(s => x(start + s));
+      for (const lesion of branch.lesion ? [branch.lesion, ...branch.further] : []) {
+        const [begin, end] = lesion.map(s => x(start + s));
         ctx.fillStyle = "#d55e0033"; ctx.fillRect(begin, top, Math.max(3, end - begin), bottom - top);
       }
       ctx.strokeStyle = "#525c6b"; ctx.lineWidth = 1.5; ctx.setLineDash([5, 4]); ctx.beginPath();
