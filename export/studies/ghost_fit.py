@@ -49,7 +49,8 @@ def fit(rows: Sequence[Row]) -> GhostModel:
     mean = np.average(figures, axis=0, weights=length)
     sd = np.sqrt(np.average((figures - mean) ** 2, axis=0, weights=length))
     sd = np.where(sd > 1e-9, sd, 1.0)
-    told = np.column_stack([(figures - mean) / sd, np.ones(len(figures))])
+    usual = GhostModel(mean, sd, np.zeros(len(mean)), 0.0)
+    told = np.column_stack([usual.standardised(figures), np.ones(len(figures))])
     weight = length / OBSERVED_MM
 
     def loss(x: Array) -> tuple[float, Array]:

@@ -23,6 +23,8 @@ from gcar_deploy.types import Array, Scalars
 
 #: a point further than this from every vessel is a ghost's, mm
 GHOST_MM = 2.0
+#: figures count up to so many standard deviations from the usual: beyond, the fit knows nothing
+MOST_SD = 3.0
 #: from this probability on a stretch is called a probable ghost, and drawn dashed
 PROBABLE = 0.5
 
@@ -42,9 +44,14 @@ class GhostModel:
     weight: Scalars
     bias: float
 
+    def standardised(self, figures: Array) -> Array:
+        """(k, figures) in standard deviations from the usual, held to ``MOST_SD``."""
+        out: Array = np.clip((figures - self.mean) / self.sd, -MOST_SD, MOST_SD)
+        return out
+
     def probability(self, figures: Array) -> Scalars:
         """(k,) of (k, figures)."""
-        out: Scalars = expit((figures - self.mean) / self.sd @ self.weight + self.bias)
+        out: Scalars = expit(self.standardised(figures) @ self.weight + self.bias)
         return out
 
 

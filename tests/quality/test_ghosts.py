@@ -147,6 +147,19 @@ def test_probabilities_go_to_points_branches_tree_and_places(monkeypatch):
     assert check_ghosts(found, usual) == [] and check_ghosts(None, QualityOptions()) == []
 
 
+def test_one_figure_far_from_all_that_was_fitted_does_not_decide_alone():
+    """Evidence of the predictor that lies elsewhere: at 3 and at 30 standard deviations."""
+    model = shipped_model()
+    sure = model.mean - 1.5 * np.sign(model.weight) * model.sd
+    unclaimed = FIGURES.index("unclaimed_least")
+    told = []
+    for far in (3.0, 30.0):
+        figures = sure.copy()
+        figures[unclaimed] = model.mean[unclaimed] + far * model.sd[unclaimed]
+        told.append(float(model.probability(figures[None])[0]))
+    assert told[0] == told[1] < 0.1
+
+
 def test_nothing_is_stated_without_evidence_or_of_three_views():
     tree = straight()
     views = [picture(tree, view) for view in CARMS]
