@@ -156,7 +156,7 @@ def _reconstructed(
         if options.deleted_mm and not refined.tree.branches:
             raise RefusedError("every branch was deleted: nothing is left")
         check_tree(refined.tree, options.quality)
-        check_length(refined.tree, options.quality)
+        check_length(refined.tree, placed.views, options.quality)
     # Nothing but the result asks for the voxels: they are made beside what follows.
     voxels = started(lambda: refined_volume(refined, placed.views, grid, options.refine))
     with waited_for(voxels) as made:

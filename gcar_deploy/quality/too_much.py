@@ -34,7 +34,7 @@ def check_found(views: Sequence[VesselImage]) -> None:
     RefusedError
         All views are of found vessels, and these exceed ``MOST_ML`` and ``MOST_LINE_MM``.
     """
-    if any(view.calibrated or view.kind == "mask" for view in views):
+    if _given(views):
         return
     volume = [_volume_ml(view) for view in views]
     length = [_line_mm(view) for view in views]
@@ -50,20 +50,25 @@ def check_found(views: Sequence[VesselImage]) -> None:
         )
 
 
-def check_length(tree: Tree, options: QualityOptions) -> None:
-    """Refuse a tree longer than the coronary arteries of a heart.
+def check_length(tree: Tree, views: Sequence[VesselImage], options: QualityOptions) -> None:
+    """Refuse a tree of found vessels that is longer than the coronary arteries of a heart.
 
     Raises
     ------
     RefusedError
         More than ``max_length_mm`` of vessel.
     """
-    if tree.length_mm > options.max_length_mm:
+    if not _given(views) and tree.length_mm > options.max_length_mm:
         raise RefusedError(
             f"{tree.length_mm:.0f} mm of vessel in {len(tree.branches)} branches are more than any "
             f"coronary tree has (at most {options.max_length_mm:g} mm are believed): what is no "
             f"vessel was taken for one; {_ADVICE}"
         )
+
+
+def _given(views: Sequence[VesselImage]) -> bool:
+    """Whether someone said of a view what is vessel in it: nothing was mistaken there."""
+    return any(view.calibrated or view.kind == "mask" for view in views)
 
 
 def _volume_ml(view: VesselImage) -> float:
