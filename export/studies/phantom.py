@@ -37,8 +37,9 @@ from gcar_deploy.types import Array, Mask, Points
 from gcar_export.evaluate.alignment import align, read_stl, sample_surface
 
 SPACING_MM = 0.390625
-#: what is fitted; the rest is predicted
-SETS = (("IM7", "IM8"), ("IM1", "IM2"), ("IM3", "IM4"), ("IM1", "IM4"))
+RUNS = ("IM1", "IM2", "IM3", "IM4", "IM7", "IM8")
+#: what is fitted, every pair and two larger sets; the rest is predicted
+PAIRS = tuple(itertools.combinations(RUNS, 2))
 THREE = ("IM1", "IM7", "IM8")
 FOUR = ("IM1", "IM4", "IM7", "IM8")
 #: near enough, pixels
@@ -128,11 +129,10 @@ def load(data: Path) -> Phantom:
     folder = next((f for f in folders if (f / "IM7.dcm").is_file()), None)
     if folder is None:
         raise UsageError(f"{data} holds no phantom_xa/IM7.dcm")
-    names = sorted({name for runs in (*SETS, FOUR) for name in runs})
     found, scene, _ = read_views(
-        [folder / f"{name}.dcm" for name in names], DicomOptions(pixel_spacing_mm=SPACING_MM)
+        [folder / f"{name}.dcm" for name in RUNS], DicomOptions(pixel_spacing_mm=SPACING_MM)
     )
-    angiograms = dict(zip(names, found, strict=True))
+    angiograms = dict(zip(RUNS, found, strict=True))
     try:
         corners, faces = read_stl((folder / "surface_coarse.stl").read_bytes())
     except (OSError, ValueError) as error:
@@ -261,11 +261,11 @@ def compare_surfaces(tree: Tree, reference: Points) -> SurfaceGap:
 def run(
     data: Path, landmarks: Path | None = None, progress: Callable[[str], None] | None = None
 ) -> tuple[Phantom, list[Fit]]:
-    """Fit every set of ``SETS`` and the four views; ``landmarks`` hold the four to each other."""
+    """Fit every pair, three and four views; ``landmarks`` hold the four to each other."""
     phantom = load(data)
     engine = Engine(threads=1, options=RunOptions())
     fits = []
-    for runs in (*SETS, THREE, FOUR):
+    for runs in (*PAIRS, THREE, FOUR):
         if progress is not None:
             progress(f"fitting {' + '.join(runs)}")
         fits.append(fit(phantom, runs, engine))
