@@ -12,7 +12,8 @@ from typing import Any
 from gcar_deploy.beside import allowed_threads
 from gcar_deploy.config import PredictOptions, RunOptions, check_options
 from gcar_deploy.config.ranges import Range, check_number
-from gcar_deploy.errors import RefusedError, UsageError
+from gcar_deploy.errors import ModelError, RefusedError, UsageError
+from gcar_deploy.files import path_of
 from gcar_deploy.imaging.extract import asks_network
 from gcar_deploy.imaging.net import Segmenter, load_segmenter
 from gcar_deploy.inputs.drawn import Drawn
@@ -63,6 +64,8 @@ class Engine:
         if threads is not None:
             check_number("threads", threads, int, Range(1, 256))
         self.threads = threads or min(os.cpu_count() or 1, 4)
+        for key, given in (("model", model), ("segmenter_model", segmenter_model)):
+            _check_model(key, given)
         wanted = self.options.predict
         self._predictor = load_predictor(model, wanted, threads=self.threads, session=session)
         self._segmenter: Segmenter | None = None
@@ -210,6 +213,17 @@ class Engine:
                 on_step=on_step,
             )
         return Result.of(found, (*notes, *missing, *found.notes))
+
+
+def _check_model(key: str, given: object) -> None:
+    """Refuse what is no path, and the empty one, which would be the working folder."""
+    if given is None:
+        return
+    try:
+        path_of(given)
+    except ValueError as error:
+        kind = ModelError if isinstance(given, str) else UsageError
+        raise kind(f"{key} {error}") from None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -86,6 +86,23 @@ def frames_in(folder: Path) -> list[Path]:
     return sorted((p for p in files if p.suffix.lower() in _FRAMES), key=natural_order)
 
 
+def path_of(value: object) -> Path:
+    """Return what names a file or folder; empty text does not, though ``Path`` takes it for ".".
+
+    Raises
+    ------
+    ValueError
+        As ``read_bounded``.
+    """
+    if not isinstance(value, (str, os.PathLike)):
+        raise ValueError(f"is a {type(value).__name__}; give a path")
+    if not os.fspath(value):
+        raise ValueError("is empty text; name a file or folder")
+    if "\0" in os.fsdecode(value):
+        raise ValueError(f"{os.fsdecode(value)!r} holds a NUL character, which no name has")
+    return Path(value)
+
+
 @contextlib.contextmanager
 def _opened(path: str | Path, max_bytes: int) -> Iterator[tuple[IO[bytes], int]]:
     """Open a regular file that is not too large; yields it with its size."""

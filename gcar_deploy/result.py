@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from gcar_deploy.errors import UsageError
+from gcar_deploy.files import path_of
 from gcar_deploy.reconstruction import Reconstruction
 
 
@@ -30,4 +32,8 @@ class Result(Reconstruction):
         # Whoever does not save need not load what only writers need.
         from gcar_deploy.output.bundle import write_result
 
-        return write_result(self, Path(out_dir), force=force, extras=extras)
+        try:
+            folder = path_of(out_dir)
+        except ValueError as error:
+            raise UsageError(f"out_dir {error}") from None
+        return write_result(self, folder, force=force, extras=extras)

@@ -288,6 +288,29 @@ def test_wrong_calls(case, engine, tmp_path):
         Engine(tmp_path / "none.onnx")
 
 
+def test_no_path_and_the_empty_one_name_nothing(case, engine, tmp_path, monkeypatch):
+    """``Path("")`` is the working folder, whose pictures would be taken for a run."""
+    angiograms, grid, scene = case
+    pixels = [a.pixels.astype(np.uint16) for a in angiograms]
+    for k, one in enumerate(pixels):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), one)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ImageError, match="view 2 is empty text"):
+        engine.reconstruct([pixels[0], ""], scene)
+    with pytest.raises(ImageError, match="mask 1 is empty text"):
+        engine.reconstruct(pixels, scene, masks={1: ""})
+    with pytest.raises(GeometryError, match="geometry is empty text"):
+        engine.reconstruct(pixels, "")
+    with pytest.raises(ModelError, match="model is empty text"):
+        Engine("")
+    with pytest.raises(UsageError, match="segmenter_model is a int"):
+        Engine(segmenter_model=3)
+    found = engine.reconstruct(angiograms, grid)
+    for wrong, words in (("", "is empty text"), (None, "is a NoneType"), ("a\0b", "NUL")):
+        with pytest.raises(UsageError, match=f"out_dir .*{words}"):
+            found.save(wrong)
+
+
 @pytest.fixture(scope="module")
 def learned():
     return Engine(threads=1)

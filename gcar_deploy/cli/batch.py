@@ -18,6 +18,7 @@ from gcar_deploy.cli.common import (
     say_result,
     talk_options,
 )
+from gcar_deploy.cli.paths import ANY_PATH
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, order_options
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
@@ -45,7 +46,7 @@ _WHERE = {
 
 
 @click.command("batch")
-@click.argument("table", type=click.Path(path_type=Path), metavar="CASES.CSV")
+@click.argument("table", type=ANY_PATH, metavar="CASES.CSV")
 @order_options(
     "out", *METHOD, "frames", "pixel_spacing_mm", "sod_mm", "allow_rescale", "segmenter", "pose",
     "strict", "force", *EXTRA_FILES,

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import ProgressBar, Talk, gathered, talk_options
+from gcar_deploy.cli.paths import ANY_PATH
 from gcar_deploy.engine_choice import EngineChoice
 
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -47,7 +48,7 @@ _EXTENT = {
 
 @click.command("bench")
 @click.option(
-    "--out", "out_dir", default=None, type=click.Path(path_type=Path),
+    "--out", "out_dir", default=None, type=ANY_PATH,
     help="New folder; needed without --stages.",
 )  # fmt: skip
 @click.option(

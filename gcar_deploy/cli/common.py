@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from gcar_deploy.cli.paths import MODEL
 from gcar_deploy.engine_choice import EngineChoice
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def engine_options(function: _Function) -> Any:
         "threads": click.option("--threads", type=click.IntRange(1, 256), help="At most so many."),
         "segmenter_model": segmenter_option,
         "model": click.option(
-            "--model", type=click.Path(), help="Predictor as an ONNX file; spec beside it."
+            "--model", type=MODEL, help="Predictor as an ONNX file; spec beside it."
         ),
     }
     return gathered("engine", EngineChoice, known)(function)
@@ -150,7 +151,7 @@ def engine_options(function: _Function) -> Any:
 
 segmenter_option = click.option(
     "--segmenter-model",
-    type=click.Path(),
+    type=MODEL,
     help="What finds vessels in raw pictures, as an ONNX file; spec beside it.",
 )
 

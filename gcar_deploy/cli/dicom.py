@@ -7,18 +7,15 @@ from pathlib import Path
 import click
 
 from gcar_deploy.cli.common import needs_extra
+from gcar_deploy.cli.paths import ANY_PATH, pictures
 
 
 @click.command("dicom")
-@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT_DIR")
-@click.argument(
-    "runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN1 RUN2 ..."
-)
+@click.argument("result", type=ANY_PATH, metavar="RESULT_DIR")
+@pictures("runs", required=True, metavar="RUN1 RUN2 ...")
+@click.option("--out", required=True, type=ANY_PATH, help="New folder for the files.")
 @click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="New folder for the files."
-)
-@click.option(
-    "--pdf", type=click.Path(path_type=Path), metavar="FILE",
+    "--pdf", type=ANY_PATH, metavar="FILE",
     help="A page printed from the report: it becomes an Encapsulated PDF.",
 )  # fmt: skip
 @click.option("--force", is_flag=True, help="Replace a folder that gcar wrote.")

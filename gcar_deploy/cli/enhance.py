@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import gathered, segmenter_option
+from gcar_deploy.cli.paths import pictures
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.config import SEGMENTERS
 from gcar_deploy.inputs.order import Order
@@ -46,7 +47,7 @@ _MEANING = {
 
 
 @click.command("enhance")
-@click.argument("picture", type=click.Path(path_type=Path))
+@pictures("picture", count=1)
 @order_options("out", "frames", "force")
 @gathered("meaning", Meaning, _MEANING)
 @click.option(
@@ -58,7 +59,7 @@ _MEANING = {
 )
 @segmenter_option
 def enhance(
-    picture: Path, order: Order, meaning: Meaning, segmenter: str, segmenter_model: str | None
+    picture: Path, order: Order, meaning: Meaning, segmenter: str, segmenter_model: Path | None
 ) -> None:
     """Write vesselness.png, mask.png and skeleton.png of PICTURE at its own size.
 

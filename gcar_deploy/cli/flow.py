@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gcar_deploy.cli.common import Talk, gathered, talk_options
+from gcar_deploy.cli.paths import ANY_PATH
 
 if TYPE_CHECKING:
     from gcar_deploy.flow import Assumption
@@ -47,10 +48,10 @@ _ASSUMED = {
 
 
 @click.command("flow")
-@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT_DIR")
+@click.argument("result", type=ANY_PATH, metavar="RESULT_DIR")
 @gathered("assumed", _assumption, _ASSUMED)
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR",
+    "--out", type=ANY_PATH, metavar="DIR",
     help="New folder for picture, open surface with caps, centreline and 0D model.",
 )  # fmt: skip
 @click.option("--force", is_flag=True, help="Replace a folder that gcar wrote.")

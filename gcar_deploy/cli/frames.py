@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.paths import pictures
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.inputs.order import Order
 
@@ -20,7 +21,7 @@ _BEST = 8
 
 
 @click.command("frames")
-@click.argument("runs", nargs=2, type=click.Path(path_type=Path), metavar="RUN1 RUN2")
+@pictures("runs", count=2, metavar="RUN1 RUN2")
 @order_options("geometry", "frames", "pixel_spacing_mm", "sod_mm", "allow_rescale", "out", "force")
 @talk_options("as_json", "quiet")
 def frames(runs: tuple[Path, Path], order: Order, talk: Talk) -> None:

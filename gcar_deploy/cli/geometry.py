@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.paths import ANY_PATH, GEOMETRY, pictures
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.inputs.order import Order
 
@@ -25,11 +26,9 @@ def geometry() -> None:
 
 
 @geometry.command("from-dicom")
-@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="RUN1 RUN2 [RUN3 ...]")
+@pictures("views", metavar="RUN1 RUN2 [RUN3 ...]")
 @order_options("frames", "pixel_spacing_mm", "sod_mm")
-@click.option(
-    "--out", "out_file", type=click.Path(path_type=Path), help="New file; else it is printed."
-)
+@click.option("--out", "out_file", type=ANY_PATH, help="New file; else it is printed.")
 def from_dicom(order: Order, out_file: Path | None) -> None:
     """Read the geometry in the headers of DICOM XA runs as the text of a geom.json.
 
@@ -60,7 +59,7 @@ def from_dicom(order: Order, out_file: Path | None) -> None:
 
 
 @geometry.command("show")
-@click.argument("path", type=click.Path(path_type=Path), metavar="GEOM_JSON")
+@click.argument("path", type=GEOMETRY, metavar="GEOM_JSON")
 @talk_options("as_json")
 def show(path: Path, talk: Talk) -> None:
     """Say in words what a scene file holds, and what its views cannot see.

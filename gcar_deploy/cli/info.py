@@ -8,9 +8,11 @@ from typing import Any
 
 import click
 
+from gcar_deploy.cli.paths import ANY_PATH
+
 
 @click.command("info")
-@click.argument("path", type=click.Path(path_type=Path), metavar="RESULT_DIR|MODEL")
+@click.argument("path", type=ANY_PATH, metavar="RESULT_DIR|MODEL")
 @click.option("--json", "as_json", is_flag=True, help="Print the content as one JSON object.")
 def info(path: Path, as_json: bool) -> None:
     """Print what a result folder holds, or a model's card, and check files against their hashes.

@@ -18,6 +18,7 @@ from gcar_deploy.cli.common import (
     talk_options,
     until_stopped,
 )
+from gcar_deploy.cli.paths import ANY_PATH
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
@@ -61,9 +62,7 @@ _SERVICE = {
 
 
 @click.command("listen")
-@click.option(
-    "--out", "out_dir", required=True, type=click.Path(path_type=Path), help="Folder of results."
-)
+@click.option("--out", "out_dir", required=True, type=ANY_PATH, help="Folder of results.")
 @gathered("service", Service, _SERVICE)
 @order_options("predictor", "refiner", "segmenter", "pose", "pixel_spacing_mm", "sod_mm")
 @engine_options

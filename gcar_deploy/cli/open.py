@@ -19,6 +19,7 @@ from gcar_deploy.cli.common import (
     serve_until_stopped,
     talk_options,
 )
+from gcar_deploy.cli.paths import pictures
 from gcar_deploy.cli.request import METHOD, READING, order_options
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order, check_view_numbers
@@ -27,7 +28,7 @@ _FOLDER = Path("gcar-cases")
 
 
 @click.command("open")
-@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="[VIEW ... | FOLDER]")
+@pictures("views", metavar="[VIEW ... | FOLDER]")
 @order_options("out", *METHOD, *READING, "file")
 @click.option("--no-browser", is_flag=True, help="Print the address; open nothing.")
 @click.option(

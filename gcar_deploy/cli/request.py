@@ -5,18 +5,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import click
 
+from gcar_deploy.cli.paths import ANY_PATH, GEOMETRY, PICTURE
 from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions
 from gcar_deploy.inputs.order import EXTRAS, POSES, Order, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_lesion, parse_mask
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Option: TypeAlias = Callable[[Any], Any]
-_FILE = click.Path(path_type=Path)
 
 
 def _choice(name: str, choices: tuple[str, ...], usual: str, text: str) -> _Option:
@@ -29,9 +28,9 @@ _USUAL = RunOptions()
 #: field of the order -> option; in the order of help
 OPTIONS: Mapping[str, _Option] = {
     "geometry": click.option(
-        "--geom", "geometry", type=_FILE, help="Geometry of the views (JSON); DICOM has its own."
+        "--geom", "geometry", type=GEOMETRY, help="Geometry of the views (JSON); DICOM has its own."
     ),
-    "out": click.option("--out", type=_FILE, help="New folder for what is written."),
+    "out": click.option("--out", type=ANY_PATH, help="New folder for what is written."),
     "predictor": _choice(
         "predictor", PREDICTORS, _USUAL.predict.predictor,
         "Who decides depth: a model, or none (the visual hull is thinned).",
@@ -89,7 +88,7 @@ OPTIONS: Mapping[str, _Option] = {
         help="Write surface.dcm (DICOM Encapsulated STL) as well.",
     ),
     "file": click.option(
-        "--order", "file", type=_FILE,
+        "--order", "file", type=ANY_PATH,
         help="Order file; what else is said on the command line goes before it.",
     ),
 }  # fmt: skip

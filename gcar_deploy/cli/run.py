@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gcar_deploy.cli.common import Talk, engine_options, say_result, talk_options
+from gcar_deploy.cli.paths import ANY_PATH, pictures
 from gcar_deploy.cli.request import EXTRA_FILES, METHOD, READING, order_options
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order, check_view_numbers, order_to_json
@@ -18,14 +19,12 @@ if TYPE_CHECKING:
 
 
 @click.command("run")
-@click.argument(
-    "views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 [VIEW3 ...]"
-)
+@pictures("views", metavar="VIEW1 VIEW2 [VIEW3 ...]")
 @order_options("out", *METHOD, *READING, "lesions", "strict", "force", *EXTRA_FILES, "file")
 @click.option("--print-order", is_flag=True, help="Print the order as JSON and do nothing else.")
 @click.option(
     "--keep-steps",
-    type=click.Path(path_type=Path),
+    type=ANY_PATH,
     metavar="DIR",
     help="New folder for what every stage made: pictures and VTP.",
 )

@@ -21,6 +21,7 @@ from gcar_deploy.cli.common import (
     serve_until_stopped,
     talk_options,
 )
+from gcar_deploy.cli.paths import ANY_PATH
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
@@ -51,11 +52,11 @@ class Limits:
 
 _DOOR = {
     "token_file": click.option(
-        "--token-file", type=click.Path(path_type=Path),
+        "--token-file", type=ANY_PATH,
         help=f"Holds the token; else {TOKEN_VARIABLE}, else one is made and printed once.",
     ),
     "folder": click.option(
-        "--folder", type=click.Path(path_type=Path),
+        "--folder", type=ANY_PATH,
         help="Orders may name files in this folder and put results there.",
     ),
     "port": click.option(

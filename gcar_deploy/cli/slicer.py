@@ -6,11 +6,13 @@ from pathlib import Path
 
 import click
 
+from gcar_deploy.cli.paths import ANY_PATH
+
 
 @click.command("slicer")
-@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT_DIR")
+@click.argument("result", type=ANY_PATH, metavar="RESULT_DIR")
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FILE.mrml",
+    "--out", type=ANY_PATH, metavar="FILE.mrml",
     help="The scene; RESULT_DIR.mrml beside the folder by default.",
 )  # fmt: skip
 @click.option("--force", is_flag=True, help="Replace a scene that is there.")

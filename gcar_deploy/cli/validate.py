@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import click
 
 from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.paths import pictures
 from gcar_deploy.cli.request import READING, order_options
 from gcar_deploy.inputs.order import Order
 
 
 @click.command(short_help="Check pictures and geometry without reconstructing.")
-@click.argument("views", nargs=-1, type=click.Path(path_type=Path), metavar="VIEW1 VIEW2 ...")
+@pictures("views", metavar="VIEW1 VIEW2 ...")
 @order_options(*READING, "predictor", "file")
 @talk_options("as_json")
 def validate(order: Order, talk: Talk) -> None:

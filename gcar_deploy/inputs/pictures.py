@@ -98,6 +98,8 @@ def _check_kinds(views: Sequence[Picture]) -> None:
                 f"view {number} is a {type(view).__name__}; give a path, an array of counts or an "
                 "Angiogram"
             )
+        if isinstance(view, str) and not view:
+            raise ImageError(f"view {number} is empty text; name a file or folder")
 
 
 def _check_masks(masks: Mapping[int, Mask]) -> None:
@@ -109,6 +111,8 @@ def _check_masks(masks: Mapping[int, Mask]) -> None:
             raise UsageError(f"masks has a {type(number).__name__} as a key; {how}")
         if not isinstance(mask, (str, Path, np.ndarray)):
             raise UsageError(f"mask {number} is a {type(mask).__name__}; {how}")
+        if isinstance(mask, str) and not mask:
+            raise ImageError(f"mask {number} is empty text; name a file")
 
 
 def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
@@ -327,6 +331,8 @@ def _scene(geometry: Geometry) -> Scene:
             raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
     if isinstance(geometry, str) and geometry.lstrip().startswith("{"):
         raise UsageError("geometry is JSON text; give a path, or json.loads of it")
+    if geometry == "":
+        raise GeometryError("geometry is empty text; name a file")
     if isinstance(geometry, (str, Path)):
         return load_scene(geometry)
     raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
 import cv2
 import numpy as np
 import pytest
@@ -295,6 +297,65 @@ def test_calls_that_end_early(name, good_case, tmp_path):
     assert done.code == code, done.err
     assert "Traceback" not in done.err and done.out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+#: call with an empty path -> exit code, what the line must name
+EMPTY: dict[str, tuple[list[str], int, str]] = {
+    "first view": (["run", "", "W", "--geom", "G", "--out", "O"], 3, "view 1 "),
+    "second view": (["run", "V", "", "--geom", "G", "--out", "O"], 3, "view 2 "),
+    "geometry": (["run", "V", "W", "--geom", "", "--out", "O"], 4, "--geom"),
+    "folder": (["run", "V", "W", "--geom", "G", "--out", ""], 2, "--out"),
+    "model": (["run", "V", "W", "--geom", "G", "--out", "O", "--model", ""], 5, "--model"),
+    "order": (["run", "--order", "", "--out", "O"], 2, "--order"),
+    "mask": (["run", "V", "W", "--geom", "G", "--out", "O", "--mask1", ""], 3, "--mask1"),
+    "validate": (["validate", "V", "", "--geom", "G"], 3, "view 2 "),
+    "frames": (["frames", "", "W"], 3, "view 1 "),
+    "enhance": (["enhance", "", "--out", "O"], 3, "view 1 "),
+    "open": (["open", "V", "", "--geom", "G"], 3, "view 2 "),
+    "open alone": (["open", ""], 3, "view 1 "),
+    "from-dicom": (["geometry", "from-dicom", "V", ""], 3, "view 2 "),
+    "show": (["geometry", "show", ""], 4, "path"),
+    "dicom": (["dicom", "O", "", "--out", "O"], 3, "view 1 "),
+    "batch": (["batch", "", "--out", "O"], 2, "path"),
+    "info": (["info", ""], 2, "path"),
+}
+
+
+@pytest.mark.parametrize("name", EMPTY)
+def test_an_empty_path_is_not_the_working_folder(name, good_case, tmp_path, monkeypatch):
+    arguments, code, words = EMPTY[name]
+    monkeypatch.chdir(good_case)  # which holds pictures
+    names = {"V": "view1.png", "W": "view2.png", "G": "geom.json", "O": tmp_path / "out"}
+    done = gcar(*(names.get(a, a) for a in arguments))
+    assert (done.code, done.out) == (code, ""), done.err
+    assert done.err.startswith(f"gcar: error: {words}") or words == "path"
+    assert "empty text; name a file or folder" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads all")
+@pytest.mark.parametrize(("name", "code"), [("view2.png", 3), ("geom.json", 4)])
+def test_a_file_that_may_not_be_read_has_the_exit_code_of_its_kind(name, code, good_case, tmp_path):
+    case = tmp_path / "case"
+    shutil.copytree(good_case, case)
+    (case / name).chmod(0)
+    done = gcar(
+        "run", case / "view1.png", case / "view2.png", "--geom", case / "geom.json",
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert (done.code, done.out) == (code, "") and name in done.err
+
+
+def test_no_path_asks_the_system_whether_it_may_be_read():
+    """As root, whom nothing is forbidden, the test above says nothing."""
+    from gcar_deploy.cli.main import VERBS
+    from gcar_deploy.cli.main import gcar as group
+
+    context = click.Context(group)
+    commands = [group.get_command(context, verb) for verb in VERBS]
+    commands += list(group.get_command(context, "geometry").commands.values())
+    kinds = [p.type for c in commands for p in c.params if isinstance(p.type, click.Path)]
+    assert len(kinds) > 20 and not any(k.readable and not k.exists for k in kinds)
 
 
 def test_open_says_at_once_that_a_picture_is_missing(good_case):
