@@ -10,7 +10,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -24,6 +24,22 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _WIDTH = 28
 #: nothing is drawn for work that is over sooner
 _PATIENCE_S = 1.0
+
+
+def say(text: str, *, nl: bool = True) -> None:
+    """Write to stderr; where nobody can read it, what is done and its exit code stay the same."""
+    try:
+        click.echo(text, err=True, nl=nl)
+    except (OSError, ValueError):
+        silence(sys.stderr)
+
+
+def silence(stream: IO[str]) -> None:
+    """Let a stream that cannot be written lead nowhere: Python would try once more at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 class ProgressBar:
@@ -40,13 +56,13 @@ class ProgressBar:
             return
         full = round(share * _WIDTH)
         bar = "#" * full + "-" * (_WIDTH - full)
-        click.echo(f"\r[{bar}] {share:4.0%} {stage:<12}", err=True, nl=False)
+        say(f"\r[{bar}] {share:4.0%} {stage:<12}", nl=False)
         self._drawn = True
 
     def close(self) -> None:
         """Wipe the line."""
         if self._drawn:
-            click.echo("\r" + " " * (_WIDTH + 24) + "\r", err=True, nl=False)
+            say("\r" + " " * (_WIDTH + 24) + "\r", nl=False)
             self._drawn = False
 
     def __enter__(self) -> ProgressBar:
@@ -82,7 +98,7 @@ class Talk:
     def note(self, lines: Iterable[str]) -> None:
         """Say sentences on stderr, unless quiet."""
         for line in () if self.quiet else lines:
-            click.echo(f"gcar: {line}", err=True)
+            say(f"gcar: {line}")
 
     @contextlib.contextmanager
     def refusals(self) -> Iterator[None]:
@@ -181,7 +197,7 @@ def until_stopped() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        click.echo("gcar: stopping", err=True)
+        say("gcar: stopping")
 
 
 def serve_until_stopped(server: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import gathered, segmenter_option
+from gcar_deploy.cli.common import gathered, say, segmenter_option
 from gcar_deploy.cli.paths import pictures
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.config import SEGMENTERS
@@ -86,7 +86,7 @@ def enhance(
     options = ImagingOptions()
     angiogram, notes = _read(picture, order, meaning)
     for note in notes:
-        click.echo(f"gcar: {note}", err=True)
+        say(f"gcar: {note}")
     pictures: dict[str, bytes] = {}
     for who in ("classic", "net") if segmenter == "both" else (segmenter,):
         chosen = dataclasses.replace(options, segmenter=who)
@@ -94,7 +94,7 @@ def enhance(
             [angiogram], chosen, load_segmenter(who, model=segmenter_model)
         )
         for note in missing:
-            click.echo(f"gcar: {note}", err=True)
+            say(f"gcar: {note}")
         found = extract_vessels(angiogram, chosen, network)
         prefix = "net_" if (segmenter, who) == ("both", "net") else ""
         pictures |= {prefix + name: p for name, p in png_files(found).items()}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gcar_deploy.cli.common import Talk, gathered, talk_options
+from gcar_deploy.cli.common import Talk, gathered, say, talk_options
 from gcar_deploy.cli.paths import ANY_PATH
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
         from gcar_deploy.output.handover import write_handover
 
         for note in write_handover(tree, drop, out, force=force):
-            click.echo(f"gcar: {note}", err=True)
+            say(f"gcar: {note}")
     if talk.as_json:
         click.echo(json.dumps(table, allow_nan=False))
     else:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.common import Talk, say, talk_options
 from gcar_deploy.cli.paths import ANY_PATH, GEOMETRY, pictures
 from gcar_deploy.cli.request import order_options
 from gcar_deploy.inputs.order import Order
@@ -47,7 +47,7 @@ def from_dicom(order: Order, out_file: Path | None) -> None:
         raise UsageError(f"{out_file} exists; name a new file")
     _, scene, notes = read_views(list(order.views), order.options(RunOptions()).dicom)
     for note in notes:
-        click.echo(f"gcar: {note}", err=True)
+        say(f"gcar: {note}")
     if out_file is None:
         click.echo(scene_to_json(scene), nl=False)
         return

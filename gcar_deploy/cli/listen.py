@@ -15,6 +15,7 @@ from gcar_deploy.cli.common import (
     engine_options,
     gathered,
     needs_extra,
+    say,
     talk_options,
     until_stopped,
 )
@@ -121,19 +122,19 @@ def listen(out_dir: Path, service: Service, order: Order, engine: EngineChoice, 
         if peer is not None:
             summary |= sent_back(folder, order.views, peer, title)
             if summary["send_error"]:
-                click.echo(f"gcar: not sent: {summary['send_error']}", err=True)
+                say(f"gcar: not sent: {summary['send_error']}")
         return summary, folder
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     queue = JobQueue(work, on_change=on_change)
     listener = Listener(
         queue, out_dir, title=title, runs=service.runs,
-        say=lambda line: click.echo(f"gcar: {line}", err=True),
+        say=lambda line: say(f"gcar: {line}"),
     )  # fmt: skip
     try:
         with until_stopped():
             found = listener.start(service.port)
-            click.echo(f"gcar: {title} on {LOOPBACK}:{found}", err=True)
+            say(f"gcar: {title} on {LOOPBACK}:{found}")
             over.wait()
     finally:
         listener.stop()

@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 
 import click
 
+from gcar_deploy.cli.common import say, silence
+
 #: verb -> (module, what ``gcar --help`` says of it); kept here so that help imports nothing.
 VERBS = {
     "run": ("gcar_deploy.cli.run", "Reconstruct a coronary tree from two or more pictures."),
@@ -115,6 +117,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     previous = signal.signal(signal.SIGTERM, _terminate)
     try:
         code = _run(arguments, verbose)
+        # What logging could not write there would be tried once more at exit, which ends with 120.
+        say("", nl=False)
     finally:
         signal.signal(signal.SIGTERM, previous)
     sys.exit(code)
@@ -126,7 +130,7 @@ def _run(arguments: list[str], verbose: bool) -> int:
     try:
         out: Any = gcar.main(arguments, prog_name="gcar", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
+        say(error.format_message())
         return error.exit_code
     except click.ClickException as error:
         return _fail(error.format_message(), error.exit_code)
@@ -137,8 +141,8 @@ def _run(arguments: list[str], verbose: bool) -> int:
     except Terminated:
         return _fail("terminated", TERMINATED)
     except BrokenPipeError:
-        # The reader of stdout went away; keep Python from complaining once more at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Of stderr, ``say`` swallows it: the reader of stdout went away.
+        silence(sys.stdout)
         return INTERNAL
     except Exception as error:
         if (stopped := _stopped(error)) is not None:
@@ -175,7 +179,7 @@ def _stopped(error: BaseException | None) -> tuple[str, int] | None:
 
 def _fail(message: str, code: int) -> int:
     line = " ".join(message.split())
-    click.echo(f"gcar: error: {line}", err=True)
+    say(f"gcar: error: {line}")
     return code
 
 

@@ -18,6 +18,7 @@ from gcar_deploy.cli.common import (
     engine_options,
     gathered,
     needs_extra,
+    say,
     serve_until_stopped,
     talk_options,
 )
@@ -168,9 +169,9 @@ def _serve_http(queue: Any, allowed: Any, token: str | None, port: int, body_mib
         token = token or secrets.token_urlsafe(32)
         app = create_app(queue, token, folder=allowed, body_mib=body_mib)
         server = listen(app, port, queue.close)
-        click.echo(f"gcar: http://{LOOPBACK}:{server.effective_port}", err=True)
+        say(f"gcar: http://{LOOPBACK}:{server.effective_port}")
         if fresh:
-            click.echo(f"gcar: token {token}", err=True)
+            say(f"gcar: token {token}")
         serve_until_stopped(server)
     finally:
         queue.close()

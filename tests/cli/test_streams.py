@@ -64,3 +64,37 @@ def test_a_result_whose_summary_nobody_can_read_stays_and_is_named(verb, good_ca
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].endswith(f"; the result lies in {tmp_path / 'out'}")
     assert (tmp_path / "out").is_dir()
+
+
+def with_stderr_gone(kind, folder, *words):
+    """Run the command with a standard error that takes nothing."""
+    command = [sys.executable, "-m", "gcar_deploy.cli.main", *map(str, words)]
+    if kind == "full":
+        with open("/dev/full", "w") as full:
+            return subprocess.run(command, stdout=subprocess.PIPE, stderr=full, cwd=folder)
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        return subprocess.run(command, stdout=subprocess.PIPE, stderr=writer, cwd=folder)
+    finally:
+        os.close(writer)
+
+
+@pytest.mark.parametrize("kind", ["reader gone", "full"])
+@pytest.mark.parametrize("code", [2, 3, 4])
+def test_an_error_that_nobody_can_read_keeps_its_exit_code(kind, code, good_case, tmp_path):
+    if kind == "full" and not os.path.exists("/dev/full"):
+        pytest.skip("needs /dev/full")
+    words = list(words_of("run", good_case, tmp_path))
+    words[{2: 0, 3: 2, 4: 4}[code]] = {2: "rum", 3: tmp_path / "no.png", 4: tmp_path / "no"}[code]
+    assert with_stderr_gone(kind, tmp_path, *words).returncode == code
+
+
+@pytest.mark.parametrize("kind", ["reader gone", "full"])
+def test_a_warning_that_nobody_can_read_costs_no_result(kind, good_case, tmp_path):
+    if kind == "full" and not os.path.exists("/dev/full"):
+        pytest.skip("needs /dev/full")
+    words = (*words_of("run", good_case, tmp_path), "--lesion", "1:1,1:3,3")  # lies on no branch
+    done = with_stderr_gone(kind, tmp_path, *words)
+    assert done.returncode == 0 and (tmp_path / "out").is_dir()
+    assert done.stdout.decode().startswith(str(tmp_path / "out"))
