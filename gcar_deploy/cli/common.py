@@ -20,10 +20,14 @@ from gcar_deploy.engine_choice import EngineChoice
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from gcar_deploy.errors import GcarError
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _WIDTH = 28
 #: nothing is drawn for work that is over sooner
 _PATIENCE_S = 1.0
+#: exit code of a refusal by the quality gate
+REFUSED = 6
 
 
 def say(text: str, *, nl: bool = True) -> None:
@@ -100,24 +104,26 @@ class Talk:
         for line in () if self.quiet else lines:
             say(f"gcar: {line}")
 
-    @contextlib.contextmanager
-    def refusals(self) -> Iterator[None]:
-        """With --json, a solve that is refused or fails is an object on stdout as well."""
-        from gcar_deploy.errors import NumericalError, RefusedError
 
-        try:
-            yield
-        except (RefusedError, NumericalError) as error:
-            if self.as_json:
-                status = "refused" if isinstance(error, RefusedError) else "failed"
-                found = {
-                    "schema": "gcar-result/1",
-                    "status": status,
-                    "sentence": str(error),
-                    "exit_code": error.exit_code,
-                }
-                click.echo(json.dumps(found))
-            raise
+class ToldError(Exception):
+    """An error that what stands on stdout tells already."""
+
+    def __init__(self, error: GcarError) -> None:
+        self.error = error
+
+
+def say_failure(sentence: str, exit_code: int) -> None:
+    """Print the object that ``--json`` promises where there is no result."""
+    found = {
+        "schema": "gcar-result/1",
+        "status": "refused" if exit_code == REFUSED else "failed",
+        "sentence": sentence,
+        "exit_code": exit_code,
+    }
+    try:
+        click.echo(json.dumps(found))
+    except OSError:
+        silence(sys.stdout)
 
 
 def say_result(text: str, folder: Path) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.common import Talk, ToldError, talk_options
 
 if TYPE_CHECKING:
     from gcar_deploy.models import Kind
@@ -38,9 +38,9 @@ def doctor(talk: Talk) -> None:
     click.echo(json.dumps(report, allow_nan=False) if talk.as_json else "\n".join(lines(report)))
     unsound = [f"{one['name']}: {one['sentence']}" for one in report["models"] if not one["sound"]]
     if unsound:
-        raise ModelError("; ".join(unsound))
+        raise ToldError(ModelError("; ".join(unsound)))
     if not report["self_test"]["passed"]:
-        raise GcarError(f"self-test failed: {report['self_test']['sentence']}")
+        raise ToldError(GcarError(f"self-test failed: {report['self_test']['sentence']}"))
 
 
 def examine() -> dict[str, Any]:

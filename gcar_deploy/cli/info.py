@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from gcar_deploy.cli.common import ToldError
 from gcar_deploy.cli.paths import ANY_PATH
 
 
@@ -41,7 +42,7 @@ def info(path: Path, as_json: bool) -> None:
     else:
         click.echo("\n".join(lines(path, summary)))
     if altered:
-        raise UsageError(f"{path}: not as it was written: {', '.join(altered)}")
+        raise ToldError(UsageError(f"{path}: not as it was written: {', '.join(altered)}"))
 
 
 def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:

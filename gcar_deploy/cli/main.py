@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import click
 
-from gcar_deploy.cli.common import say, silence
+from gcar_deploy.cli.common import ToldError, say, say_failure, silence
 
 #: verb -> (module, what ``gcar --help`` says of it); kept here so that help imports nothing.
 VERBS = {
@@ -132,10 +132,13 @@ def _run(arguments: list[str], verbose: bool) -> int:
     except click.exceptions.NoArgsIsHelpError as error:
         say(error.format_message())
         return error.exit_code
-    except click.ClickException as error:
-        return _fail(error.format_message(), error.exit_code)
-    except GcarError as error:
-        return _fail(str(error), error.exit_code)
+    except ToldError as told:
+        return _fail(str(told.error), told.error.exit_code)
+    except (click.ClickException, GcarError) as error:
+        sentence = error.format_message() if isinstance(error, click.ClickException) else str(error)
+        if "--json" in arguments and _has_option(arguments, "--json"):
+            say_failure(sentence, error.exit_code)
+        return _fail(sentence, error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted", INTERRUPTED)
     except Terminated:
@@ -155,15 +158,19 @@ def _run(arguments: list[str], verbose: bool) -> int:
         if verbose:
             logging.getLogger("gcar_deploy").exception("internal error")
         detail = str(error).splitlines()[0] if str(error) else ""
-        hint = "; see -v" if _has_verbose(arguments) else ""
+        hint = "; see -v" if _has_option(arguments, "-v") else ""
         return _fail(f"internal error: {type(error).__name__} {detail}".strip() + hint, INTERNAL)
     return out if isinstance(out, int) else 0
 
 
-def _has_verbose(arguments: list[str]) -> bool:
-    """Whether the verb says more with ``-v``."""
-    verb = gcar.get_command(click.Context(gcar), arguments[0] if arguments else "")
-    return verb is not None and any("-v" in option.opts for option in verb.params)
+def _has_option(arguments: list[str], name: str) -> bool:
+    """Whether the verb has an option: ``-v`` to say more, ``--json`` for one object."""
+    verb: click.Command | None = gcar
+    for word in arguments:
+        if not isinstance(verb, click.Group):
+            break
+        verb = verb.get_command(click.Context(verb), word)
+    return verb is not None and any(name in option.opts for option in verb.params)
 
 
 def _stopped(error: BaseException | None) -> tuple[str, int] | None:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import click
 
-from gcar_deploy.cli.paths import ANY_PATH, GEOMETRY, PICTURE
+from gcar_deploy.cli.paths import ANY_PATH, GEOMETRY
 from gcar_deploy.config import PREDICTORS, REFINERS, SEGMENTERS, RunOptions
 from gcar_deploy.inputs.order import EXTRAS, POSES, Order, load_order
 from gcar_deploy.inputs.words import parse_frames, parse_landmark, parse_lesion, parse_mask

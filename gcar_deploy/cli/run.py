@@ -56,11 +56,10 @@ def run(
 
     out = check_target_of(order)
     on_step = None if keep_steps is None else _step_folder(keep_steps, out)
-    with talk.refusals():
-        with talk.bar() as bar:
-            result = engine.engine(order).reconstruct_order(order, on_progress=bar, on_step=on_step)
-        talk.note(result.notes)
-        folder = deliver(result, order)
+    with talk.bar() as bar:
+        result = engine.engine(order).reconstruct_order(order, on_progress=bar, on_step=on_step)
+    talk.note(result.notes)
+    folder = deliver(result, order)
     if talk.as_json:
         text = json.dumps({"out": str(folder), **result.summary()}, allow_nan=False)
     else:

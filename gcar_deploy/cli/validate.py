@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from gcar_deploy.cli.common import Talk, talk_options
+from gcar_deploy.cli.common import Talk, ToldError, talk_options
 from gcar_deploy.cli.paths import pictures
 from gcar_deploy.cli.request import READING, order_options
 from gcar_deploy.inputs.order import Order
@@ -35,7 +35,7 @@ def validate(order: Order, talk: Talk) -> None:
     found = inspect_files(order.views, order.geometry, options, order.masks, order.drawn)
     click.echo(json.dumps(found.to_dict()) if talk.as_json else "\n".join(_lines(found)))
     if found.error is not None:
-        raise found.error
+        raise ToldError(found.error)
 
 
 def _lines(found: Any) -> list[str]:

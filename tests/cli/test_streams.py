@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from importlib import resources
 
 import pytest
+
+from tests.cli.conftest import gcar
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="shells")
 
@@ -98,3 +102,35 @@ def test_a_warning_that_nobody_can_read_costs_no_result(kind, good_case, tmp_pat
     done = with_stderr_gone(kind, tmp_path, *words)
     assert done.returncode == 0 and (tmp_path / "out").is_dir()
     assert done.stdout.decode().startswith(str(tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "code"),
+    [
+        (("--predictor", "x"), 2), (("--landmark", "x"), 2), (("--mask", "1:no.png"), 3),
+        (("--geom", "no.json"), 4), (("--model", "no.onnx"), 5), (("--strict",), 6),
+        (("--deadline", "1e-6"), 7),
+    ],
+)  # fmt: skip
+def test_json_is_one_object_whatever_went_wrong(wrong, code, good_case, tmp_path):
+    jsonschema = pytest.importorskip("jsonschema")
+    words = [*words_of("run", good_case, tmp_path), "--json", *wrong]
+    if code == 5:
+        words = [word for word in words if word not in ("--predictor", "none")]
+    done = gcar(*words)
+    assert done.code == code
+    found = json.loads(done.out)
+    assert (found["status"], found["exit_code"]) == ("refused" if code == 6 else "failed", code)
+    assert done.err.splitlines()[-1] == "gcar: error: " + " ".join(found["sentence"].split())
+    schema = resources.files("gcar_deploy.output").joinpath("result.schema.json").read_text()
+    jsonschema.validate(found, json.loads(schema))
+
+
+def test_json_of_what_tells_its_own_errors_stays_one_object(good_case, tmp_path):
+    looked = ("validate", good_case / "view1.png", tmp_path / "no.png", "--json")
+    done = gcar(*looked, "--geom", good_case / "geom.json")
+    assert done.code == 3 and json.loads(done.out)["schema"] == "gcar-validation/1"
+    done = gcar("geometry", "show", tmp_path / "no.json", "--json")
+    assert done.code == 4 and json.loads(done.out)["status"] == "failed"
+    done = gcar("info", tmp_path / "no", "--json")
+    assert done.code == 2 and json.loads(done.out)["status"] == "failed"
