@@ -44,7 +44,7 @@ INTERRUPTED, TERMINATED, INTERNAL = 130, 143, 1
 
 
 class Terminated(BaseException):
-    """SIGTERM arrived; raised so that unfinished folders are taken away."""
+    """SIGTERM or SIGHUP arrived; raised so that unfinished folders are taken away."""
 
 
 class LazyGroup(click.Group):
@@ -114,13 +114,21 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     # Many small products: shared out, they wait for each other where another program has a core,
     # and last digits depend on the cores. Heeded only before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    previous = signal.signal(signal.SIGTERM, _terminate)
+    # A terminal that goes away (SIGHUP, where there is such a signal) must leave nothing either;
+    # nohup has it ignored.
+    kinds = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
+    previous = {
+        kind: signal.signal(kind, _terminate)
+        for kind in kinds
+        if kind is not None and signal.getsignal(kind) != signal.SIG_IGN
+    }
     try:
         code = _run(arguments, verbose)
         # What logging could not write there would be tried once more at exit, which ends with 120.
         say("", nl=False)
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for kind, own in previous.items():
+            signal.signal(kind, own)
     sys.exit(code)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from importlib import resources
 
 import pytest
 
+from gcar_deploy.cli import main as entry
 from tests.cli.conftest import gcar
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="shells")
@@ -22,6 +24,23 @@ def in_shell(redirected, folder, *words):
          *map(str, words)],
         capture_output=True, text=True, cwd=folder,
     )  # fmt: skip
+
+
+def test_what_nohup_ignores_stays_ignored(monkeypatch):
+    kept = []
+    monkeypatch.setattr(
+        entry.gcar, "main", lambda *_, **__: kept.append(signal.getsignal(signal.SIGHUP))
+    )
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert gcar("run").code == 0
+        assert [*kept, signal.getsignal(signal.SIGHUP)] == [signal.SIG_IGN] * 2
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        assert gcar("run").code == 0
+        assert kept[1] is entry._terminate
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def words_of(verb, case, folder):

@@ -259,7 +259,7 @@ def test_the_slower_of_two_runs_is_told_as_if_it_had_come_later(
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)],
+    [("SIGTERM", 143), ("SIGHUP", 143), pytest.param("SIGINT", 130, marks=pytest.mark.slow)],
 )
 @pytest.mark.req("REQ-24")
 def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
@@ -268,6 +268,7 @@ def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
         "import signal, sys, time\n"
         # A test run in the background hands down that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "from gcar_deploy.cli import main as cli\n"
         "from gcar_deploy.output import folder\n"
         "from gcar_deploy.cli.main import main\n"
@@ -286,7 +287,7 @@ def test_signals_leave_nothing_and_end_with_their_code(tmp_path, number, code):
         assert process.stdout is not None
         assert process.stdout.readline().strip() == "writing"
         time.sleep(0.1)
-        process.send_signal(number)
+        process.send_signal(getattr(signal, number))
         _, errors = process.communicate(timeout=300)
     assert process.returncode == code
     assert errors.strip().splitlines()[-1].startswith("gcar: error:")
