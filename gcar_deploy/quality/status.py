@@ -306,10 +306,11 @@ def view_quality(
         gap = _distance_to(line)[seen]
         weight = view.path_mm[seen].astype(np.float64)
         weight = weight / weight.sum() if weight.any() else np.full(len(gap), 1 / len(gap))
-        coverage = float(weight @ (gap <= near_px))
+        # Weights that sum to 1 but for the last digit do not make a share above it.
+        coverage = min(float(weight @ (gap <= near_px)), 1.0)
         even = float((gap <= near_px).mean())
         distance = float(gap.mean() * pixel_mm)
-        strict = float(weight @ (gap <= 2.0))
+        strict = min(float(weight @ (gap <= 2.0)), 1.0)
         visible = line & view.valid
         if visible.any():
             support = float((_distance_to(view.mask)[visible] <= near_px).mean())

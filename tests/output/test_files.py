@@ -12,12 +12,14 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.measured import measured
 from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.tables import centerline_vtp, gaussians_ply
 from gcar_deploy.output.volume import nifti_bytes
 from gcar_deploy.plain import plain
+from tests.conftest import ready_case
 
 
 @pytest.mark.req("REQ-25")
@@ -54,6 +56,18 @@ def test_result_json_is_strict_and_follows_its_schema(folder):
     jsonschema.Draft202012Validator.check_schema(json.loads(schema))
     jsonschema.validate(summary, json.loads(schema))
     assert summary["reasons"]["/model"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["P_0595", "P_0001", "C_0595", "M_0401"])
+def test_results_of_real_trees_follow_the_schema(name):
+    jsonschema = pytest.importorskip("jsonschema")
+    case = ready_case(name)
+    found = Engine(threads=1).reconstruct(
+        [case / "view1.png", case / "view2.png"], case / "geom.json"
+    )
+    schema = resources.files("gcar_deploy.output").joinpath("result.schema.json").read_text()
+    jsonschema.validate(json.loads(json.dumps(found.summary())), json.loads(schema))
 
 
 @pytest.mark.req("REQ-26")

@@ -85,6 +85,18 @@ def test_no_tree_at_all_is_refused_with_its_reason(case):
         judge(empty_tree(), views, [], RunOptions(), disagreement=0.0, evidence=None)
 
 
+def test_no_share_is_above_one_by_its_last_digit(case):
+    """Normalised weights may sum to a digit more, which the schema of a result refuses."""
+    _, views, tree = case
+    shape = views[0].path_mm.shape
+    for seed in range(12):
+        paths = np.random.default_rng(seed).uniform(0.5, 3.0, shape).astype(np.float32)
+        view = dataclasses.replace(views[0], path_mm=paths)
+        quality = view_quality(tree, view, view.mask, dataclasses.replace(OPTIONS, near_px=99.0))
+        assert quality.coverage <= 1.0 and quality.coverage_2px <= 1.0
+        assert quality.coverage == pytest.approx(1.0, abs=1e-12)
+
+
 def test_undefined_figures_are_none(case):
     _, views, _ = case
     quality = view_quality(empty_tree(), views[0], np.zeros_like(views[0].mask), OPTIONS)
