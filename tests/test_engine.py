@@ -238,12 +238,28 @@ def test_nothing_is_printed(case, engine, capfd):
         (np.full((96, 96), np.nan, np.float32), "finite"),
         (np.full((96, 96), -1.0), "negative"),
         (np.zeros((1, 1), np.uint8), "1 x 1"),
+        (np.zeros((96, 96), bool), "bool"),
+        (np.ma.masked_less(np.ones((96, 96)), [[2.0, 0.0] * 48]), "4608 pixels .* masked"),
     ],
 )
 def test_unfit_arrays(case, engine, array, words):
     angiograms, _, scene = case
     with pytest.raises(ImageError, match=words):
         engine.reconstruct([angiograms[0].pixels, array], scene)
+
+
+def test_masks_of_truth_values_and_arrays_without_a_masked_pixel_are_taken(case, engine):
+    angiograms, _, scene = case
+    views = tuple(dataclasses.replace(v, intensity=Intensity(kind="mask")) for v in scene.views)
+    drawn = dataclasses.replace(scene, views=views)
+    truth = [a.pixels > 300 for a in angiograms]
+    found = engine.reconstruct(truth, drawn)
+    grey = [one.astype(np.uint8) * 255 for one in truth]
+    assert content(engine.reconstruct([np.ma.asarray(one) for one in grey], drawn)) == content(
+        found
+    )
+    with pytest.raises(ImageError, match=r"mask 2: .* masked"):
+        engine.reconstruct(grey, drawn, masks={2: np.ma.masked_equal(grey[1], 0)})
 
 
 def test_path_lengths_with_noise_about_zero_are_taken(case, engine):

@@ -137,7 +137,10 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
             except GeometryError as error:
                 notes.append(f"its pixel size is not known: {error}")
     else:
-        pixels = read_picture(picture, ImagingOptions().limits, subtracted=intensity.subtracted)
+        pixels = read_picture(
+            picture, ImagingOptions().limits, subtracted=intensity.subtracted,
+            binary=meaning.kind == "mask",
+        )  # fmt: skip
     angiogram = Angiogram.without_geometry("picture", pixels, intensity, pixel_mm)
     if pixel_mm is None:
         notes.append(

@@ -23,6 +23,7 @@ _UNSIGNED, _FLOATING = 1, 3
 _TIFF_KINDS = "8 or 16 bit grey, or 32 bit floating-point grey, is needed"
 #: JPEG as a TIFF compression, old and new
 _JPEG = (6, 7)
+_TURNED = "asks to be turned (orientation tag); export it the right way up"
 _MAX_TIFF_ENTRIES = 256
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 
@@ -36,14 +37,17 @@ def check_sides(rows: int, columns: int, smallest: int, largest: int) -> None:
         )
 
 
-def check_png(data: bytes, smallest: int, largest: int) -> int:
-    """Walk the chunks of a PNG file; return its bit depth.
+def check_png(data: bytes, smallest: int, largest: int, *, binary: bool = False) -> int:
+    """Walk the chunks of a PNG file; return the bit depth that it decodes to.
+
+    ``binary``: grey of 1 bit, as masks are kept, is taken as well; it decodes to 8.
 
     Raises
     ------
     ValueError
-        Not a PNG, truncated, checksum wrong, animated, palette, transparent, bit depth other
-        than 8 or 16, sides out of range, or data that inflate to another size than promised.
+        Not a PNG, truncated, checksum wrong, animated, palette, transparent, turned by its
+        orientation, bit depth other than 8 or 16, sides out of range, or data that inflate to
+        another size than promised.
     """
     header: tuple[int, int, int, int, int] | None = None
     pixels = bytearray()
@@ -52,11 +56,13 @@ def check_png(data: bytes, smallest: int, largest: int) -> int:
         if header is None:
             if kind != b"IHDR" or len(body) != 13:
                 raise ValueError("does not begin with a PNG header; export the picture again")
-            header = _png_header(body, smallest, largest)
+            header = _png_header(body, smallest, largest, binary)
         elif kind in _ANIMATION:
             raise ValueError("is an animated PNG; export one frame as an ordinary PNG")
         elif kind == b"tRNS":
             raise ValueError("has transparent pixels; export it without transparency")
+        elif kind == b"eXIf":
+            _check_upright(body)
         elif kind == b"IDAT":
             pixels += body
         elif kind == b"IEND":
@@ -65,7 +71,7 @@ def check_png(data: bytes, smallest: int, largest: int) -> int:
     if header is None or not ended:
         raise ValueError("is truncated; copy or export it again")
     _check_inflated(bytes(pixels), *header)
-    return header[2]
+    return max(header[2], 8)
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -85,7 +91,9 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         at += 12 + length
 
 
-def _png_header(body: bytes, smallest: int, largest: int) -> tuple[int, int, int, int, int]:
+def _png_header(
+    body: bytes, smallest: int, largest: int, binary: bool
+) -> tuple[int, int, int, int, int]:
     columns, rows, depth, colour, compression, filtering, interlace = struct.unpack(
         ">IIBBBBB", body
     )
@@ -94,15 +102,28 @@ def _png_header(body: bytes, smallest: int, largest: int) -> tuple[int, int, int
         raise ValueError("uses a colour palette; export it as 8 or 16 bit grey")
     if colour not in _CHANNELS or compression or filtering or interlace > 1:
         raise ValueError("has an invalid PNG header; export it again")
-    if depth not in (8, 16):
+    if depth not in (8, 16) and not (binary and (depth, colour) == (1, 0)):
         raise ValueError(f"has {depth} bits per pixel; 8 or 16 bit grey is needed")
     return rows, columns, depth, colour, interlace
+
+
+def _check_upright(exif: bytes) -> None:
+    """Refuse a picture whose EXIF data ask to be turned; what cannot be read asks nothing."""
+    if exif[:4] not in TIFF_SIGNATURES:
+        return
+    order = "<" if exif[:2] == b"II" else ">"
+    try:
+        tags, _ = _tiff_directory(exif, order, _first_page(exif, order))
+    except ValueError:
+        return
+    if _one(tags, 274, 1) != 1:
+        raise ValueError(_TURNED)
 
 
 def _check_inflated(
     packed: bytes, rows: int, columns: int, depth: int, colour: int, interlace: int
 ) -> None:
-    pixel_bytes = _CHANNELS[colour] * depth // 8
+    pixel_bits = _CHANNELS[colour] * depth
     if interlace:
         # Adam7: (first column, first row, column step, row step) of the seven passes.
         steps: tuple[tuple[int, int, int, int], ...]
@@ -111,9 +132,9 @@ def _check_inflated(
         expected = 0
         for x, y, dx, dy in steps:
             wide, high = -((x - columns) // dx), -((y - rows) // dy)
-            expected += high * (1 + wide * pixel_bytes) if wide > 0 and high > 0 else 0
+            expected += high * (1 + -(-wide * pixel_bits // 8)) if wide > 0 and high > 0 else 0
     else:
-        expected = rows * (1 + columns * pixel_bytes)
+        expected = rows * (1 + -(-columns * pixel_bits // 8))
     inflater = zlib.decompressobj()
     try:
         size = len(inflater.decompress(packed, expected + 1))
@@ -123,8 +144,10 @@ def _check_inflated(
         raise ValueError("is damaged (more or fewer pixels than its header says); copy it again")
 
 
-def check_tiff(data: bytes, smallest: int, largest: int) -> int:
-    """Read the only directory of a TIFF file; return its bit depth.
+def check_tiff(data: bytes, smallest: int, largest: int, *, binary: bool = False) -> int:
+    """Read the only directory of a TIFF file; return the bit depth that it decodes to.
+
+    ``binary``: as of ``check_png``.
 
     Raises
     ------
@@ -136,7 +159,7 @@ def check_tiff(data: bytes, smallest: int, largest: int) -> int:
     tags, next_page = _tiff_directory(data, order, _first_page(data, order))
     if next_page:
         raise ValueError("holds several pages; export the one frame to be used")
-    return _check_tiff_page(data, tags, smallest, largest)[0]
+    return _check_tiff_page(data, tags, smallest, largest, binary)[0]
 
 
 def check_tiff_pages(
@@ -180,7 +203,7 @@ def _first_page(data: bytes, order: str) -> int:
 
 
 def _check_tiff_page(
-    data: bytes, tags: dict[int, tuple[int, ...]], smallest: int, largest: int
+    data: bytes, tags: dict[int, tuple[int, ...]], smallest: int, largest: int, binary: bool = False
 ) -> tuple[int, tuple[int, int]]:
     """Return bit depth and (rows, columns) of one page."""
     rows, columns = _one(tags, 257, 0), _one(tags, 256, 0)
@@ -190,21 +213,23 @@ def _check_tiff_page(
             "holds a JPEG picture: its compression loses thin vessels; export it without, or as PNG"
         )
     depths, formats = set(tags.get(258, (1,))), set(tags.get(339, (_UNSIGNED,)))
-    if len(depths) != 1 or not depths <= {8, 16, 32}:
+    if len(depths) != 1 or not depths <= {8, 16, 32, *([1] if binary else [])}:
         raise ValueError(f"has {sorted(depths)} bits per sample; {_TIFF_KINDS}")
     if formats != {_FLOATING if 32 in depths else _UNSIGNED}:
         raise ValueError(f"holds signed samples or floating-point numbers of 16 bit; {_TIFF_KINDS}")
     if _one(tags, 262, -1) not in (1, 2):
         raise ValueError("is not plain grey (black is zero); export it as 8 or 16 bit grey")
     if _one(tags, 274, 1) != 1:
-        raise ValueError("asks to be turned (orientation tag); export it the right way up")
+        raise ValueError(_TURNED)
     if not 1 <= _one(tags, 277, 1) <= (1 if 32 in depths else 4):
         raise ValueError("has an invalid number of channels; export it as 8 or 16 bit grey")
-    _check_tiff_data(data, tags, rows * columns)
-    return depths.pop(), (rows, columns)
+    _check_tiff_data(data, tags, rows, columns)
+    return max(*depths, 8), (rows, columns)
 
 
-def _check_tiff_data(data: bytes, tags: dict[int, tuple[int, ...]], pixels: int) -> None:
+def _check_tiff_data(
+    data: bytes, tags: dict[int, tuple[int, ...]], rows: int, columns: int
+) -> None:
     starts = tags.get(273) or tags.get(324) or ()
     counts = tags.get(279) or tags.get(325) or ()
     if not starts or len(starts) != len(counts):
@@ -212,8 +237,8 @@ def _check_tiff_data(data: bytes, tags: dict[int, tuple[int, ...]], pixels: int)
     for start, count in zip(starts, counts, strict=True):
         if start + count > len(data):
             raise ValueError("is truncated; copy or export it again")
-    bytes_per_pixel = tags.get(258, (8,))[0] // 8 * _one(tags, 277, 1)
-    if _one(tags, 259, 1) == 1 and sum(counts) < pixels * bytes_per_pixel:
+    bits_per_pixel = tags.get(258, (1,))[0] * _one(tags, 277, 1)
+    if _one(tags, 259, 1) == 1 and sum(counts) < rows * -(-columns * bits_per_pixel // 8):
         raise ValueError("is truncated; copy or export it again")
 
 

@@ -36,7 +36,11 @@ SUFFIXES = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".npy": "NPY"}
 
 
 def read_picture(
-    path: str | Path, limits: PictureLimits | None = None, *, subtracted: bool = False
+    path: str | Path,
+    limits: PictureLimits | None = None,
+    *,
+    subtracted: bool = False,
+    binary: bool = False,
 ) -> tuple[Image, int, str]:
     """Read a picture; the file is opened once, only for reading.
 
@@ -48,6 +52,7 @@ def read_picture(
         non-negative float32/64).
     limits : PictureLimits, optional
     subtracted : bool, another picture was, so that noise lies about 0; see ``from_zero``
+    binary : bool, it is a mask: truth values (NPY) and grey of 1 bit (PNG, TIFF) are taken too
 
     Returns
     -------
@@ -64,7 +69,7 @@ def read_picture(
     path = Path(path)
     try:
         data = read_bounded(path, limits.max_bytes)
-        array, depth = _decode(data, path.suffix.lower(), limits)
+        array, depth = _decode(data, path.suffix.lower(), limits, binary)
         array = from_zero(array) if subtracted else array
         _check_counts(array)
     except ValueError as error:
@@ -146,7 +151,7 @@ def quiet_decoder(*, unless: bool = False) -> Iterator[None]:
             cv2.utils.logging.setLogLevel(level)
 
 
-def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Array, int]:
+def _decode(data: bytes, suffix: str, limits: PictureLimits, binary: bool) -> tuple[Array, int]:
     expected = SUFFIXES.get(suffix)
     if data.startswith(_JPEG_SIGNATURE):
         raise ValueError(
@@ -159,9 +164,9 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits) -> tuple[Array, int
         what = f"is a {found} file" if found else f"is not a {expected} file"
         raise ValueError(f"{what} though it is named {suffix}; export it as {expected}")
     if found == "NPY":
-        return _decode_npy(data, limits)
+        return _decode_npy(data, limits, binary)
     check = png_guard.check_png if found == "PNG" else png_guard.check_tiff
-    depth = check(data, limits.min_side, limits.max_side)
+    depth = check(data, limits.min_side, limits.max_side, binary=binary)
     try:
         # UNCHANGED: GRAYSCALE would make 8 bit of 16 and obey an EXIF rotation.
         # Of 8 bit, OpenCV takes a TIFF that it cannot decode, and its own line is all that tells.
@@ -197,7 +202,7 @@ def _one_channel(picture: Array) -> Array:
     return picture[..., 0]
 
 
-def _decode_npy(data: bytes, limits: PictureLimits) -> tuple[Array, int]:
+def _decode_npy(data: bytes, limits: PictureLimits, binary: bool) -> tuple[Array, int]:
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)
@@ -210,7 +215,8 @@ def _decode_npy(data: bytes, limits: PictureLimits) -> tuple[Array, int]:
         shape, fortran, dtype = readers[version](stream)
     except (ValueError, TypeError, SyntaxError, EOFError, tokenize.TokenError, *_HEADER):
         raise ValueError("has a damaged NPY header; save it again with numpy.save") from None
-    if dtype.hasobject or dtype.newbyteorder("=").name not in _NPY_DEPTH or dtype.names:
+    depths = {**_NPY_DEPTH, "bool": 8} if binary else _NPY_DEPTH
+    if dtype.hasobject or dtype.newbyteorder("=").name not in depths or dtype.names:
         raise ValueError("holds other values than uint8, uint16, float32 or float64; convert it")
     if len(shape) != 2:
         raise ValueError(f"has {len(shape)} dimensions; save one grey picture (rows, columns)")
@@ -219,7 +225,7 @@ def _decode_npy(data: bytes, limits: PictureLimits) -> tuple[Array, int]:
         raise ValueError("is truncated or has bytes to spare; save it again with numpy.save")
     array = np.frombuffer(data, dtype, offset=stream.tell())
     array = array.reshape(shape, order="F" if fortran else "C")
-    return array, _NPY_DEPTH[dtype.newbyteorder("=").name]
+    return array, depths[dtype.newbyteorder("=").name]
 
 
 def from_zero(array: Array) -> Array:

@@ -159,7 +159,10 @@ def with_masks(
     out = list(angiograms)
     for number, given in masks.items():
         place = _index(number, "mask", out)
-        array = given if isinstance(given, np.ndarray) else read_picture(given, limits)[0]
+        if isinstance(given, np.ndarray):
+            array = _unmasked(f"mask {number}", given)
+        else:
+            array = read_picture(given, limits, binary=True)[0]
         shape = out[place].pixels.shape
         if array.shape != shape:
             raise ImageError(
@@ -237,7 +240,10 @@ def _angiogram(
     if isinstance(picture, np.ndarray):
         read = _from_array(view, picture, options.limits)
     else:
-        read = read_picture(picture, options.limits, subtracted=view.intensity.subtracted)
+        kind = view.intensity
+        read = read_picture(
+            picture, options.limits, subtracted=kind.subtracted, binary=kind.kind == "mask"
+        )
     return _as_angiogram(read, view, options, notes, picture)
 
 
@@ -297,6 +303,9 @@ def _from_array(
 ) -> tuple[np.ndarray, int, str]:
     """Like ``read_picture`` for counts that are in memory already."""
     view_id = view.id
+    array = _unmasked(f"view {view_id}", array)
+    if array.dtype == bool and view.intensity.kind == "mask":
+        array = array.astype(np.uint8)
     depth = _DEPTHS.get(array.dtype.name)
     if depth is None or array.ndim != 2:
         raise ImageError(
@@ -319,6 +328,17 @@ def _from_array(
     sha256 = hashlib.sha256(f"{given.dtype.name}{given.shape}".encode())
     sha256.update(np.ascontiguousarray(given).tobytes())
     return pixels, depth, sha256.hexdigest()
+
+
+def _unmasked(name: str, array: np.ndarray) -> np.ndarray:
+    """Return a plain array; what numpy's masked pixels hold is nobody's grey value."""
+    count = int(np.ma.count_masked(array)) if isinstance(array, np.ma.MaskedArray) else 0
+    if count:
+        raise ImageError(
+            f"{name}: {count} pixels of the array are masked; fill them (numpy.ma.filled), or give "
+            "an Angiogram whose valid leaves them out"
+        )
+    return np.asarray(array)
 
 
 def _scene(geometry: Geometry) -> Scene:

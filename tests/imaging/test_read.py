@@ -77,7 +77,35 @@ def test_exif_rotation_is_not_obeyed(tmp_path):
     tags = struct.pack(">HHHIHH", 1, 0x0112, 3, 1, 6, 0) + bytes(4)
     exif = png_chunk(b"eXIf", b"MM\x00*\x00\x00\x00\x08" + tags)
     (tmp_path / "p.png").write_bytes(png(rows=20, columns=40, before=[exif]))
-    assert read_picture(tmp_path / "p.png")[0].shape == (20, 40)
+    with pytest.raises(ImageError, match=r"p.png: asks to be turned \(orientation tag\)"):
+        read_picture(tmp_path / "p.png")
+    upright = png_chunk(b"eXIf", exif[8:-4].replace(b"\x00\x06", b"\x00\x01"))
+    for harmless in (upright, png_chunk(b"eXIf", b"MM\x00*\xff"), png_chunk(b"eXIf", b"")):
+        (tmp_path / "p.png").write_bytes(png(rows=20, columns=40, before=[harmless]))
+        assert read_picture(tmp_path / "p.png")[0].shape == (20, 40)
+
+
+def test_a_mask_of_one_bit_is_taken_where_a_mask_is_asked_for(tmp_path):
+    """The commonest thing that a segmentation gives."""
+    truth = np.random.default_rng(3).random((20, 21)) > 0.5
+    rows = np.packbits(truth, axis=1)
+    packed = b"".join(b"\0" + row.tobytes() for row in rows)
+    (tmp_path / "m.png").write_bytes(png(20, 21, depth=1, data=packed))
+    bits = {"t256": 21, "t257": 20, "t258": 1, "t278": 20, "t279": rows.size}
+    (tmp_path / "m.tif").write_bytes(_tiff(**bits)[:200] + rows.tobytes())
+    np.save(tmp_path / "m.npy", truth)
+    for name in ("m.png", "m.tif", "m.npy"):
+        with pytest.raises(ImageError):
+            read_picture(tmp_path / name)
+        pixels, depth, _ = read_picture(tmp_path / name, binary=True)
+        np.testing.assert_array_equal(pixels > 0, truth)
+        assert depth == 8
+    (tmp_path / "m.png").write_bytes(png(20, 21, depth=1, data=packed + b"\0"))
+    with pytest.raises(ImageError, match="more or fewer pixels"):
+        read_picture(tmp_path / "m.png", binary=True)
+    (tmp_path / "m.tif").write_bytes(_tiff(**{**bits, "t279": rows.size - 1})[:200] + bytes(99))
+    with pytest.raises(ImageError, match="truncated"):
+        read_picture(tmp_path / "m.tif", binary=True)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 33), (23, 19)])
