@@ -27,7 +27,12 @@ from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.pictures import Geometry, Mask, prepare
 from gcar_deploy.pose import landmark_pixels, register
 from gcar_deploy.predict import Predictor, load_predictor, quick_tree, seen_by_all
-from gcar_deploy.quality import check_candidates, check_found, check_views
+from gcar_deploy.quality import (
+    check_candidates,
+    check_found,
+    check_gross_scale,
+    check_views,
+)
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.tree import Tree
 
@@ -162,6 +167,7 @@ def _registered(
     with placed.hinting():
         hull = seen_by_all(placed.views, grid, marked, predictor()).hull
         check_candidates(len(hull), hull.lattice, marked.quality)
+    check_gross_scale(angiograms, views)
     return list(placed.findings)
 
 

@@ -36,6 +36,7 @@ from gcar_deploy.quality import (
     Remark,
     check_candidates,
     check_found,
+    check_gross_scale,
     check_length,
     check_tree,
     check_views,
@@ -138,6 +139,7 @@ def _reconstructed(
         seen = seen_by_all(placed.views, grid, options, predictor)
         keep(seen)
         check_candidates(len(seen.hull), seen.hull.lattice, options.quality)
+    check_gross_scale(angiograms, vessels.views)
     with watch.stage("centers"):
         centers = find_centers(seen, predictor, options, watch)
         keep(centers)

@@ -49,6 +49,8 @@ class Angiogram:
         Frames of the same run before contrast came; what is a line there is no vessel.
     file : str
         Name of the file that it was read from; empty for an array.
+    enlarged : float
+        How many times as many rows it has as the geometry says; below 1 it was made smaller.
     """
 
     view_id: str
@@ -64,6 +66,7 @@ class Angiogram:
     frame: ChosenFrame | None = None
     bare: tuple[Image, ...] = ()
     file: str = ""
+    enlarged: float = 1.0
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)
@@ -145,6 +148,8 @@ class VesselImage:
     kept : callable or None
         Gives the same with nothing taken for a device, where something was: few pairs ask. It is
         made once, however often it is asked for.
+    enlarged : float
+        As of the ``Angiogram``, for ``calibrated`` ones.
     """
 
     view_id: str
@@ -164,6 +169,7 @@ class VesselImage:
     noise_mm: float = 0.0
     others: tuple[VesselImage, ...] = ()
     kept: Callable[[], VesselImage] | None = None
+    enlarged: float = 1.0
 
     def __post_init__(self) -> None:
         masks = (self.mask, self.skeleton, self.valid, self.catheter, self.painted)

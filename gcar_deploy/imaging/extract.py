@@ -222,6 +222,7 @@ def _from_path_length(angiogram: Angiogram) -> VesselImage:
         path_mm=np.where(mask, path, np.float32(0)),
         path_error=0.0,
         noise_mm=noise,
+        enlarged=angiogram.enlarged,
         mask=mask,
         skeleton=skel.skeletonize(mask),
         valid=valid,

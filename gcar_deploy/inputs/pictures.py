@@ -255,6 +255,7 @@ def _as_angiogram(
     return Angiogram(
         view_id=view.id, carm=_matched(view, pixels.shape, options, notes, source), pixels=pixels,
         bit_depth=depth, intensity=view.intensity, sha256=sha256,
+        enlarged=pixels.shape[0] / view.carm.rows,
     )  # fmt: skip
 
 

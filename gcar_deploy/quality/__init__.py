@@ -22,6 +22,7 @@ from gcar_deploy.quality.ghosts import (
     ghost_share,
 )
 from gcar_deploy.quality.gravity import Part, Remark
+from gcar_deploy.quality.scale import check_gross_scale
 from gcar_deploy.quality.status import (
     Quality,
     ViewQuality,
@@ -47,6 +48,7 @@ __all__ = [
     "check_consistency",
     "check_explained",
     "check_found",
+    "check_gross_scale",
     "check_length",
     "check_motion",
     "check_order",

@@ -8,14 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
+from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
-from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.path_noise import vessels_in_noise
+from gcar_deploy.imaging.skeleton import skeletonize
+from gcar_deploy.inspection import inspect_files
 from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.quality.human_range import check_human_range
-from gcar_deploy.quality.scale import check_scale, scale_factor
+from gcar_deploy.quality.scale import check_gross_scale, check_scale, scale_factor
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import Branch, Tree
 
@@ -141,6 +144,55 @@ def test_all_views_together_tell_a_scale_to_a_tenth(first, second, said):
     views = [picture(tree, factor=first), picture(tree, across, factor=second)]
     found = check_scale(tree, views)
     assert (said in found[0] and "all views" in found[0]) if said else found == []
+
+
+def test_an_enlarged_picture_has_wider_shadows_and_is_told_so():
+    tree, across = tube((0.2, 0.1, 1.0)), dataclasses.replace(CARM, primary_angle_deg=60)
+    views = [picture(tree, factor=0.89), picture(tree, across, factor=0.89)]
+    mean = "gcar_deploy.quality.scale.mean_factor"
+    with pytest.MonkeyPatch.context() as patch:
+        for factor, enlarged, words in (
+            (0.9, 1.0, "says; is mm_per_count"), (0.9, 2.0, ""), (1.12, 2.0, "says; is mm"),
+            (0.8, 2.0, "says; enlarging a picture widens shadows; or is mm_per_count"),
+        ):  # fmt: skip
+            patch.setattr(mean, lambda *_, f=factor: f)
+            found = check_scale(tree, [dataclasses.replace(v, enlarged=enlarged) for v in views])
+            assert (words in found[0]) if words else found == []
+    # Enlarged, pixels as wide as vessels do not become fine ones.
+    wide = picture(tree, dataclasses.replace(CARM, pixel_spacing_mm=(0.8, 0.8)), 1.4, radius=2.0)
+    assert check_scale(tree, [wide]) != []
+    assert check_scale(tree, [dataclasses.replace(wide, enlarged=2.0)]) == []
+
+
+def test_a_scale_that_is_far_off_is_refused_on_the_pictures_own_lines():
+    tree = tube((1.0, 0.2, 0.6))
+    given = Angiogram(
+        view_id="1", carm=CARM, pixels=np.zeros((512, 512), np.float32), bit_depth=16, sha256="1",
+        intensity=Intensity(kind="path_length", mm_per_count=0.001),
+    )  # fmt: skip
+    views = {f: picture(tree, factor=f) for f in (0.1, 1.0, 2.0, 4.0, 10.0)}
+    views = {f: dataclasses.replace(v, skeleton=skeletonize(v.mask)) for f, v in views.items()}
+    for factor in (0.1, 1.0, 2.0):
+        check_gross_scale([given], [views[factor]])
+    for factor in (4.0, 10.0):
+        with pytest.raises(RefusedError, match=r"view 1: .* about .*; is mm_per_count"):
+            check_gross_scale([given], [views[factor]])
+    # A line that a person drew has no width; what is not calibrated has no scale.
+    check_gross_scale([dataclasses.replace(given, mask=views[4.0].mask)], [views[4.0]])
+    check_gross_scale([given], [dataclasses.replace(views[4.0], path_error=0.3)])
+
+
+def test_a_scale_that_is_far_off_costs_no_fit_and_validate_knows_it(monkeypatch):
+    def refine(*_, **__):
+        raise AssertionError("fitted")
+
+    angiograms, grid, _ = tiny_case()
+    monkeypatch.setattr("gcar_deploy.reconstruct.refine", refine)
+    wrong = [dataclasses.replace(a, pixels=a.pixels * np.float32(10)) for a in angiograms]
+    with pytest.raises(RefusedError, match="mm_per_count"):
+        Engine(threads=1).reconstruct(wrong, grid)
+    assert "mm_per_count" in str(inspect_files(wrong, grid).error)
+    assert inspect_files(angiograms, grid).error is None
 
 
 def test_pictures_without_calibration_are_not_judged():
