@@ -348,6 +348,7 @@ class Reconstruction:
             "distance_mm": judged.distance_mm,
             "overlap": judged.overlap,
             "coverage_2px": judged.coverage_2px,
+            "coverage_even": judged.coverage_even,
             "left_out": judged.left_out,
             "match_rate": judged.match_rate,
             "foreshortening": judged.foreshortening,

@@ -96,7 +96,8 @@ def lines(path: Path, summary: dict[str, Any]) -> list[str]:
         f"  views {summary['separation_deg']:.1f} deg apart; {summary['seconds']['total']:.2f} s",
     ]
     for view in summary["views"]:
-        told = explained(view["coverage"], view.get("left_out", 0.0))
+        even = view.get("coverage_even")
+        told = explained(view["coverage"], even, view.get("left_out", 0.0))
         out.append(f"  view {view['id']} ({view['name']}): {told}")
     out.append(f"  files: {', '.join(summary.get('files', {}))}")
     out.append(f"  {summary['use']}")

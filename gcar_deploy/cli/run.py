@@ -87,6 +87,6 @@ def summary_lines(result: Any, out_dir: Path) -> list[str]:
         f"{len(result.gaussians.means_mm)} Gaussians, {result.seconds['total']:.2f} s"
     )
     for view in result.quality.views:
-        told = explained(view.coverage, view.left_out)
+        told = explained(view.coverage, view.coverage_even, view.left_out)
         lines.append(f"view {view.view_id} ({view.name}): {told}")
     return lines

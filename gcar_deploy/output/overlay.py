@@ -196,7 +196,7 @@ def _labels(canvas: Array, judged: ViewQuality) -> None:
     size = max(canvas.shape[1] / 1000, 0.6)
     _text(canvas, f"View {judged.view_id}: {judged.name}", (14, round(34 * size)), size)
     if judged.coverage is not None:
-        text = explained(judged.coverage, judged.left_out)
+        text = explained(judged.coverage, judged.coverage_even, judged.left_out)
         _text(canvas, text, (14, round(62 * size)), 0.7 * size)
 
 

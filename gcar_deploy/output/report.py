@@ -105,7 +105,7 @@ def _figure(number: int, view: Mapping[str, Any], picture: Array, most_bytes: in
     name = html.escape(f"View {view['id']}: {view['name']}")
     source = base64.b64encode(_jpeg(picture, most_bytes)).decode("ascii")
     details = [
-        explained(view["coverage"], view["left_out"]),
+        explained(view["coverage"], view["coverage_even"], view["left_out"]),
         f"{_share(view['support'])} of the tree seen",
         f"overlap (Dice) {_number(view['overlap'])}",
         f"mean distance {_number(view['distance_mm'], ' mm')}",

@@ -249,7 +249,7 @@ def check_explained(
             )
         for value, least, good, what in (
             (one.coverage, options.min_coverage, options.good_coverage,
-             "of the vessels seen in the picture are explained by the tree"),
+             "of the vessels seen, weighed by thickness, is explained by the tree"),
             (one.support, options.min_support, options.good_support,
              "of the tree lies on the picture's vessels"),
         ):  # fmt: skip

@@ -121,6 +121,11 @@ def test_run_prints_the_folder_first_and_nothing_on_stderr(good_case, tmp_path):
     assert done.code == 0, done.err
     lines = done.out.splitlines()
     assert lines[0] == str(tmp_path / "out") and lines[1].startswith(("ok:", "degraded:"))
+    views = json.loads((tmp_path / "out" / "result.json").read_text())["views"]
+    assert lines[-1].endswith(
+        f"{views[-1]['coverage_even']:.0%} of the length of the vessels seen is explained "
+        f"({views[-1]['coverage']:.0%} weighed by thickness)"
+    )
     assert done.err == ""
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 

@@ -151,11 +151,12 @@ def test_a_catheter_has_a_colour_and_a_line_in_the_legend():
 
 
 @pytest.mark.parametrize(("left_out", "more"), [
-    (0.0, ""), (0.019, ""), (0.118, " (12% of what looks like vessel was left out)"),
+    (0.0, ""), (0.019, ""), (0.118, "; 12% of what looks like vessel was left out"),
 ])  # fmt: skip
-def test_what_was_left_out_is_said_beside_what_is_explained(left_out, more):
-    assert explained(0.94, left_out) == f"94% of the vessels seen are explained{more}"
-    assert explained(None, 0.0).startswith("- of the vessels")
+def test_length_weight_and_what_was_left_out_are_said_together(left_out, more):
+    said = f"69% of the length of the vessels seen is explained (94% weighed by thickness{more})"
+    assert explained(0.94, 0.69, left_out) == said
+    assert explained(None, None, 0.0).startswith("- of the vessels")
     assert "vessel without a partner" in LEFT_OUT
 
 

@@ -102,10 +102,11 @@ def test_research_use_is_said_and_size_is_small(text):
 def test_what_was_left_out_is_in_legend_and_caption(result, text):
     assert LEFT_OUT not in text and "was left out" not in text
     summary = result.summary()
-    summary["views"][1]["left_out"] = 0.12
+    summary["views"][1] |= {"coverage": 0.93, "coverage_even": 0.69, "left_out": 0.12}
     page = report_html(result, summary, [np.zeros((16, 16, 3), np.uint8)] * 2)
     assert page.count(LEFT_OUT) == 1
-    assert page.count("are explained (12% of what looks like vessel was left out);") == 1
+    told = "(93% weighed by thickness; 12% of what looks like vessel was left out);"
+    assert page.count(f"69% of the length of the vessels seen is explained {told}") == 1
 
 
 def test_the_headline_is_not_listed_once_more(result):

@@ -81,7 +81,7 @@ def test_a_tree_somewhere_else_is_refused(case):
 def test_no_tree_at_all_is_refused_with_its_reason(case):
     """By the whole judgement: nothing that is asked of a tree may fail for want of one."""
     _, views, _ = case
-    with pytest.raises(RefusedError, match="only 0% of the vessels"):
+    with pytest.raises(RefusedError, match="only 0% of the vessels seen, weighed by thickness"):
         judge(empty_tree(), views, [], RunOptions(), disagreement=0.0, evidence=None)
 
 
@@ -163,8 +163,9 @@ def test_a_thin_vessel_that_is_missed_counts_less_than_a_thick_one(found):
     bars = both(thick, straight((1, 0, 0), radius=1.0, middle=(0, 0, -12)))
     view = extract_vessels(paths(bars)[0], ImagingOptions())
     part = dataclasses.replace(bars, branches=bars.branches[found : found + 1])
-    share = view_quality(part, view, view.mask, OPTIONS).coverage
-    assert share == pytest.approx((2 / 3, 1 / 3)[found], abs=0.04)
+    judged = view_quality(part, view, view.mask, OPTIONS)
+    assert judged.coverage == pytest.approx((2 / 3, 1 / 3)[found], abs=0.04)
+    assert judged.coverage_even == pytest.approx(0.5, abs=0.03)
     pale = dataclasses.replace(view, path_mm=0 * view.path_mm)  # nothing to weigh by
     assert view_quality(part, pale, view.mask, OPTIONS).coverage == pytest.approx(0.5, abs=0.03)
 

@@ -174,6 +174,9 @@ def test_a_stated_alternative_is_shown_and_picked(serve, browse):
     rows, stated = page.locator("#lesions tbody tr"), page.locator("#alternatives li")
     before, texts = rows.count(), stated.all_inner_texts()
     assert "a ghost with probability" in texts[0]
+    titles = page.locator(".view .title").all_inner_texts()
+    told = "% of the length explained ("
+    assert [told in t and "% weighed by thickness)" in t for t in titles[:2]] == [True] * 2
     nothing_serious(page)
     tree = page.locator(".view canvas").last
     unmarked = tree.screenshot()

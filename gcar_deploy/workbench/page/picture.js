@@ -130,9 +130,9 @@ export class Picture {
     this.tools.draw(this, ctx);
     if (this.cross) this.crosshair(ctx);
     if (this.tools.draws && this.hover) ring(ctx, ...this.hover, Math.max(2, this.tools.brush / 2 * k), "#fff");
-    const share = this.store.result?.summary.views[this.number - 1].coverage;
+    const share = this.store.result?.summary.views[this.number - 1] ?? {}, percent = value => `${Math.round(100 * value)} %`;
     this.title.replaceChildren(`${info.id}: ${info.name}`, el("small", {}, [
-      this.store.result && share !== null ? `${Math.round(100 * share)} % of the vessels explained` : "",
+      share.coverage_even != null ? `${percent(share.coverage_even)} of the length explained (${percent(share.coverage)} weighed by thickness)` : "",
       this.frame()].filter(t => t).join(" \u00b7 ")));
   }
   frame() {
