@@ -224,7 +224,7 @@ def check_motion(
     motions: Sequence[tuple[float, bool, float]],
     options: QualityOptions,
 ) -> list[str]:
-    """Judge the motion of the heart between the runs, beyond a shift.
+    """Judge what the views disagree by beyond a shift, as a heart that moved makes them.
 
     Parameters
     ----------
@@ -235,19 +235,23 @@ def check_motion(
     findings = []
     exact = kind_of(views) == "exact"
     for view, (moved, undone, rigid) in zip(views, motions, strict=True):
-        told = f"view {view.view_id}: beyond a shift the heart moved by {moved:.1f} mm "
-        where = "(root mean square) across the planes of the beams"
+        # What is measured leads: a wrong angle or distance looks like motion.
+        told = (
+            f"view {view.view_id}: beyond a shift the contours of the views disagree by "
+            f"{moved:.1f} mm{'' if undone else ' or more'} (root mean square across the planes of "
+            "the beams): the heart moved between the runs, or an angle or distance is a little off"
+        )
         # Masks and raw pictures show motion only where it bends the tree.
         small = exact and moved <= options.good_motion_mm and rigid <= options.good_disagreement
         if moved and undone and not small:
             findings.append(
-                f"{told}{where}; that is undone, but as much within the planes leaves no trace "
+                f"{told}; that is undone, but as much within the planes leaves no trace "
                 "and bends the tree"
             )
         elif moved and not undone:
             findings.append(
-                f"{told}or more {where}, or an angle is wrong: vessels of both pictures turn and "
-                "end in other planes; that is not undone and bends the tree"
+                f"{told}; vessels of both pictures turn and end in other planes, which is not "
+                "undone and bends the tree"
             )
     return findings
 

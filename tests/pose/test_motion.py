@@ -130,3 +130,6 @@ def test_motion_that_bends_the_tree_degrades():
     (undone,) = check_motion(inexact, [none, (0.4, True, 0.02)], limits)
     (left,) = check_motion(inexact, [none, (0.4, False, 0.02)], limits)
     assert "that is undone" in undone and "0.4 mm or more" in left
+    for said in (large, undone, left):  # a wrong angle of a rigid scene looks alike
+        assert said.startswith("view 2: beyond a shift the contours of the views disagree by ")
+        assert "the heart moved between the runs, or an angle or distance is a little off" in said
