@@ -71,6 +71,18 @@ def test_every_exit_code_is_explained():
     assert "130, 143" in page
 
 
+def test_confidence_is_called_a_score_and_no_probability():
+    """Most points of 0.2 to 0.4 are right; what is calibrated is ``ghost_probability``."""
+    row = re.search(
+        r"^\| confidence \|.*$", (DOCS / "glossary.md").read_text("utf-8"), re.MULTILINE
+    )
+    schema = (ROOT / "gcar_deploy" / "output" / "result.schema.json").read_text(encoding="utf-8")
+    told = re.findall(r'"confidence": \{\s+"description": "(.+?)"', schema)
+    for said in (row[0] if row else "", *told):
+        assert "score" in said and "no probability" in said and "ghost_probability" in said, said
+    assert len(told) == 1
+
+
 def test_pictures_are_small():
     sizes = {p.name: p.stat().st_size for p in (DOCS / "pictures").iterdir()}
     assert max(sizes.values()) < 200_000 and sum(sizes.values()) < 1_000_000

@@ -16,7 +16,8 @@ class CenterPoints:
     Attributes
     ----------
     points_mm : (n, 3) mm LPS
-    confidence : (n,) 0 .. 1, share of the cell round the point believed to be vessel
+    confidence : (n,) 0 .. 1, share of the cell round the point believed to be vessel; a score
+        that ranks points, not a calibrated probability
     radius_mm : (n,) expected vessel radius at the point, mm; NaN where unknown
     spacing_mm : float
         Edge of the lattice cells the points stand for, mm: ``confidence * spacing_mm**3``

@@ -121,7 +121,8 @@ def centerline_csv(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
     """One row per centreline point; an unknown sigma, ghost or name is an empty field.
 
     The covariance is the sum of fit and geometry. Branches are numbered from 1, as in the
-    pictures, the report and ``centerline.vtp``. ``ghosts`` as there.
+    pictures, the report and ``centerline.vtp``. ``ghosts`` as there; ``confidence`` is the
+    predictor's score, which ranks points but is not calibrated.
     """
     columns_of_points = ["arc_mm", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence"]
     more = ["sigma_fit_mm", "sigma_geometry_mm", *(f"cov_{name}_mm2" for name in _ENTRIES)]

@@ -20,7 +20,8 @@ class Branch:
     points_mm : (m, 3) centreline, mm LPS, m >= 2
     radius_mm : (m,) lumen radius, mm
     sigma_mm : (m,) standard deviation of the position (worst direction), mm; NaN if unknown
-    confidence : (m,) 0 .. 1, mean confidence of the starting points nearest to the line here
+    confidence : (m,) 0 .. 1, mean confidence of the starting points nearest to the line here; a
+        score that ranks points, not a calibrated probability
     start, end : int
         Rows of ``Tree.nodes_mm``.
     covariance_mm2 : (m, 2, 3, 3) covariance of the position across the vessel, mm^2 LPS: what the
