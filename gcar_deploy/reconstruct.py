@@ -143,11 +143,11 @@ def _reconstructed(
     with watch.stage("centers"):
         centers = find_centers(seen, predictor, options, watch)
         keep(centers)
+    told = None if centers.evidence is None else centers.evidence.points
     with watch.stage("refine") as report:
         refined = refine(
-            centers.points, placed.views, options.refine, report, watch.budget(),
-            None if centers.evidence is None else centers.evidence.points,
-        ).or_fail()  # fmt: skip
+            centers.points, placed.views, options.refine, report, watch.budget(), told
+        ).or_fail()
         signals = [
             read_signal(a, v)
             for a, v in zip(placed.pictures(angiograms), placed.views, strict=True)
@@ -157,7 +157,7 @@ def _reconstructed(
         keep(refined)
         if options.deleted_mm and not refined.tree.branches:
             raise RefusedError("every branch was deleted: nothing is left")
-        check_tree(refined.tree, options.quality)
+        check_tree(refined.tree, options.quality, None if told is None else told.confidence)
         check_length(refined.tree, placed.views, options.quality)
     # Nothing but the result asks for the voxels: they are made beside what follows.
     voxels = started(lambda: refined_volume(refined, placed.views, grid, options.refine))

@@ -19,9 +19,12 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.types import Scalars
 
 #: exact views of which vessels are cut are believed when they ask for a shift up to this, mm
 CUT_SHIFT_MM = 1.0
+#: a model that is nowhere as confident as this finds no vessel, whatever the pictures show
+LEAST_FOUND = 0.5
 #: disagreement along the epipolar lines, for those who never heard of them
 NO_MATCH = "no match where the beams of both views meet"
 
@@ -316,8 +319,12 @@ def check_candidates(count: int, lattice: Grid, options: QualityOptions) -> None
         )
 
 
-def check_tree(tree: Tree, options: QualityOptions) -> None:
+def check_tree(tree: Tree, options: QualityOptions, confidence: Scalars | None = None) -> None:
     """Refuse what is too little to be a coronary tree.
+
+    Parameters
+    ----------
+    confidence : what a model said of all points of the hull; None where none was asked
 
     Raises
     ------
@@ -325,6 +332,11 @@ def check_tree(tree: Tree, options: QualityOptions) -> None:
         Less than ``min_length_mm`` of vessel.
     """
     if tree.length_mm < options.min_length_mm:
+        if confidence is not None and np.max(confidence, initial=0.0) < LEAST_FOUND:
+            raise RefusedError(
+                "the model finds no vessel (largest confidence "
+                f"{np.max(confidence, initial=0.0):.2f} of 1); is it trained?"
+            )
         raise RefusedError(
             f"only {tree.length_mm:.0f} mm of vessel are seen by all views "
             f"(at least {options.min_length_mm:g} mm are needed); do the views show one tree?"

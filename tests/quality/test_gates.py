@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gcar_deploy.config import QualityOptions
+from gcar_deploy.config import QualityOptions, RunOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.scene import Intensity
+from gcar_deploy.predict.center_predictor import CenterPredictor
+from gcar_deploy.predict.kinds import read_predictor
 from gcar_deploy.quality.gates import (
     best_separation,
     check_candidates,
@@ -22,9 +26,12 @@ from gcar_deploy.quality.gates import (
     with_hint,
 )
 from gcar_deploy.quality.too_much import MOST_LINE_MM, MOST_ML, check_found, check_length
+from gcar_deploy.reconstruct import reconstruct
+from gcar_deploy.selftest import tiny_case
 from gcar_deploy.tree.tree import empty_tree
 
 OPTIONS = QualityOptions()
+TINY_MODEL = Path(__file__).parents[1] / "data" / "tiny.onnx"
 
 
 def turned(angiogram, primary):
@@ -177,3 +184,24 @@ def test_more_tree_than_a_heart_has(case):
     with pytest.raises(RefusedError, match=r"more than any coronary tree has.*give masks"):
         check_length(tree, found, less)
     check_length(tree, case[1], less)  # of true path lengths: nothing was mistaken
+
+
+def test_a_model_that_finds_nothing_is_named_and_not_the_pictures():
+    """As one that was hardly trained: no point of the hull is believed."""
+
+    class Faint:
+        def run(self, _names, feed, _options):
+            return [np.full((feed["ray"].shape[1], 5), 0.02, np.float32)]
+
+    untrained = dataclasses.replace(read_predictor(TINY_MODEL), golden=None)
+    predictor = CenterPredictor(untrained, session=Faint())
+    angiograms, grid, _ = tiny_case()
+    kind = Intensity(kind="mask")  # exact pictures make up for it
+    masks = [
+        dataclasses.replace(a, pixels=(a.pixels > 0.1).astype(np.float32), intensity=kind)
+        for a in angiograms
+    ]
+    with pytest.raises(RefusedError, match=r"finds no vessel \(largest confidence 0.02 of 1\)"):
+        reconstruct(masks, grid, RunOptions(), predictor=predictor)
+    with pytest.raises(RefusedError, match="do the views show one tree"):
+        check_tree(empty_tree(), OPTIONS, np.array([0.1, 0.9]))
