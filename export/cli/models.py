@@ -36,6 +36,7 @@ def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) ->
     Example: gcar-export export runs/a/checkpoint.safetensors --out models/gcp-multi.onnx
     """
     from gcar_export.shipping.parity import export_checked
+    from gcar_export.shipping.task_check import hardly_trained
 
     _check_free(out, force, int8)
     found = export_checked(checkpoint, out, inputs)
@@ -44,6 +45,12 @@ def export(checkpoint: Path, out: Path, inputs: int, int8: bool, force: bool) ->
         f"{found.decisions_equal:.4%} of decisions equal; task: Dice {found.task_torch:.4f} with "
         f"torch, {found.task_runtime:.4f} through the runtime"
     )
+    if hardly_trained(out, found.task_runtime):
+        click.echo(
+            f"gcar-export: warning: {out} finds little of the vessels (task Dice "
+            f"{found.task_runtime:.2f}); the one that comes along reaches 0.69: is it trained?",
+            err=True,
+        )
     if int8:
         from gcar_export.shipping.quantize import quantize_checked
 

@@ -23,6 +23,7 @@ from gcar_deploy.predict.encoding import (
     input_names,
 )
 from gcar_export.scenes.gantry import PAPER_VIEWS, USUAL_SPREAD_DEG, USUAL_VIEWS
+from gcar_export.shipping.quiet import quiet_tracing
 from gcar_export.shipping.row_blocks import in_blocks
 from gcar_export.training.checkpoint import network_of, read_manifest
 from gcar_export.training.dataset import PATH_CELLS, training_scene
@@ -94,7 +95,8 @@ def export_model(checkpoint: Path, out: Path) -> dict[str, Any]:
     """
     net = deployed(checkpoint)
     out.parent.mkdir(parents=True, exist_ok=True)
-    program = _trace_sparse(net) if isinstance(net, DeployedSparse) else _trace_unet(net)
+    with quiet_tracing():
+        program = _trace_sparse(net) if isinstance(net, DeployedSparse) else _trace_unet(net)
     program.save(str(out), external_data=False)
     spec = _spec(net, _training(checkpoint), out.stem)
     return finish(out, spec)

@@ -34,6 +34,7 @@ from gcar_export.scenes.angiograms import training_pair
 from gcar_export.shipping.export_onnx import IR_VERSION, OPSET
 from gcar_export.shipping.golden import write_golden
 from gcar_export.shipping.parity import PARITY
+from gcar_export.shipping.quiet import quiet_tracing
 from gcar_export.training.checkpoint import network_of
 from gcar_export.training.networks.line_net import LineNet, LineNetConfig, no_vessel
 from gcar_export.training.networks.mask_unet import MaskUNet, MaskUNetConfig
@@ -181,16 +182,17 @@ def export_segmenter(
     points, near = torch.zeros(50, POINT), torch.zeros(50, NEAR, dtype=torch.int64)
     rows, cols = (torch.export.Dim(n, min=2, max=512) for n in ("rows", "cols"))
     count = torch.export.Dim("count", min=2, max=10**6)
-    program: Any = torch.onnx.export(
-        net,
-        (example, points, near),
-        dynamo=True,
-        opset_version=OPSET,
-        external_data=False,
-        input_names=list(INPUTS),
-        output_names=list(OUTPUTS),
-        dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols}, {0: count}, {0: count}),
-    )
+    with quiet_tracing():
+        program: Any = torch.onnx.export(
+            net,
+            (example, points, near),
+            dynamo=True,
+            opset_version=OPSET,
+            external_data=False,
+            input_names=list(INPUTS),
+            output_names=list(OUTPUTS),
+            dynamic_shapes=({2: STRIDE * rows, 3: STRIDE * cols}, {0: count}, {0: count}),
+        )
     partial = out.with_name(f"{out.stem}.partial.onnx")
     new = not out.parent.exists()
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,7 @@ from gcar_deploy.predict.center_predictor import (
     open_predictor,
 )
 from gcar_deploy.predict.decision import decide
-from gcar_deploy.predict.kinds import read_predictor
+from gcar_deploy.predict.kinds import MULTI, read_predictor
 from gcar_deploy.types import Scalars
 from gcar_export.shipping.export_onnx import DeployedSparse, deployed, graph_inputs
 from gcar_export.training.dataset import TrainingScene, training_scene
@@ -32,6 +32,8 @@ from gcar_export.training.paper_dataset import training_pictures
 
 #: seed of the scenes; neither training nor validation draws from it
 SEED = 80_001
+#: a predictor of all views with a lower Dice leaves no tree of most pictures
+LEAST_DICE = 0.5
 #: how near a centre of a single view must be, pixel edges
 REACH_PIXELS = 1.5
 
@@ -39,6 +41,11 @@ REACH_PIXELS = 1.5
 def task_measure(model: ModelFile | Predictor, scenes: int) -> float:
     """Mean score over so many scenes."""
     return float(np.mean([score for _, score in scores(model, scenes)]))
+
+
+def hardly_trained(model: Path, measured: float) -> bool:
+    """Whether what was measured is too little; a single view's shares are low in any case."""
+    return read_predictor(model).kind == MULTI.name and measured < LEAST_DICE
 
 
 def scores(model: ModelFile | Predictor, scenes: int) -> list[tuple[str, float]]:

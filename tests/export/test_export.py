@@ -12,7 +12,7 @@ from gcar_deploy.errors import ModelError
 from gcar_deploy.predict.kinds import read_predictor
 from gcar_export.cli.main import main
 from gcar_export.shipping import parity as parity_module
-from gcar_export.shipping.export_onnx import load_checkpoint
+from gcar_export.shipping.export_onnx import export_model, load_checkpoint
 from gcar_export.shipping.parity import Parity, accept, export_checked, parity
 from gcar_export.shipping.quantize import quantize_checked
 from gcar_export.shipping.task_check import task_measure, torch_predictor
@@ -56,7 +56,18 @@ def test_a_model_is_replaced_only_when_asked(exported):
     )
     assert model.read_bytes() == before
     arguments = ["export", str(checkpoint), "--out", str(model), "--force", "--inputs", "1"]
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0
+    # The predictor of all views has a Dice, and an untrained one a low one.
+    warned = "is it trained?" in done.stderr
+    assert warned == (read_predictor(model).kind == "multi")
+
+
+@pytest.mark.parametrize("network", ["sparse", "unet"])
+def test_nothing_of_torch_own_troubles_is_printed(tmp_path, capfd, recwarn, network):
+    export_model(write_tiny_checkpoint(tmp_path, network=network), tmp_path / "m.onnx")
+    assert "torchvision" not in capfd.readouterr().err
+    assert not [str(w.message) for w in recwarn]
 
 
 def test_card_of_the_file_is_that_of_the_spec(exported):
