@@ -41,10 +41,12 @@ RESEARCH_USE = "Research use only. Not a medical device; not for diagnosis or tr
 _PACKAGES = (
     "gcar", "numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "onnxruntime",
 )  # fmt: skip
+#: keys of a branch: stated wherever it is long enough, and of a lesion alone
 _LUMEN = (
-    "/minimal_diameter_mm", "/minimal_at_mm", "/reference_diameter_mm", "/stenosis_percent",
-    "/lesion_length_mm", "/minimal_sigma_mm", "/area_stenosis_percent", "/plaque_free_mm",
+    "minimal_diameter_mm", "minimal_at_mm", "reference_diameter_mm", "stenosis_percent",
+    "lesion_length_mm", "minimal_sigma_mm", "area_stenosis_percent", "plaque_free_mm",
 )  # fmt: skip
+_LESION = ("lesion_mm", "proximal_reference_mm", "distal_reference_mm")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -243,7 +245,7 @@ class Reconstruction:
         }
         out: dict[str, Any] = plain(body, "", reasons)
         for path in reasons:
-            if path.startswith("/tree/branches/") and path.endswith((*_LUMEN, "/lesions")):
+            if path.startswith("/tree/branches/") and path.split("/")[-1] in (*_LUMEN, "lesions"):
                 reasons[path] = "the branch is too short to state a stenosis"
             if "/picture/frame/" in path:
                 reasons[path] = (
@@ -393,17 +395,7 @@ def _branch(
         "mean_sigma_mm": float(known.mean()) if len(known) else None,
         **_sigma(branch, carms),
         "confidence": float(branch.confidence.mean()),
-        "minimal_diameter_mm": lumen.minimal_diameter_mm,
-        "minimal_at_mm": lumen.minimal_at_mm,
-        "reference_diameter_mm": lumen.reference_diameter_mm,
-        "stenosis_percent": lumen.stenosis_percent,
-        "lesion_length_mm": lumen.lesion_length_mm,
-        "minimal_sigma_mm": lumen.minimal_sigma_mm,
-        "area_stenosis_percent": lumen.area_stenosis_percent,
-        "lesion_mm": lumen.lesion_mm,
-        "proximal_reference_mm": lumen.proximal_reference_mm,
-        "distal_reference_mm": lumen.distal_reference_mm,
-        "plaque_free_mm": lumen.plaque_free_mm,
+        **{key: getattr(lumen, key) for key in (*_LUMEN, *_LESION)},
         "lesions": lumen.lesions and [dataclasses.asdict(one) for one in lumen.lesions],
         **({} if lumen.narrows_to_mm is None else {"narrows_to_mm": lumen.narrows_to_mm}),
     }

@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from gcar_deploy import __version__
 from gcar_deploy.errors import GcarError, GeometryError, UsageError
-from gcar_deploy.geometry.fields import read_json
+from gcar_deploy.geometry.fields import quote, read_json
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
 from gcar_deploy.worker.jobs import DONE, Job, JobQueue
@@ -46,17 +46,20 @@ class LineServer:
         self._source, self._sink, self._folder = source, sink, folder
         self._writing = threading.Lock()
         self._asking = threading.Lock()
+        self._gone = threading.Event()
         self._request_of: dict[str, Any] = {}
         self._queue = make_queue(self._changed)
 
     def run(self) -> None:
-        """Serve until the input ends or ``shutdown`` comes; open jobs are cancelled then."""
+        """Serve until either stream ends or ``shutdown`` comes; open jobs are cancelled then."""
         try:
-            while line := self._source.readline(MOST_CHARACTERS):
+            while not self._gone.is_set() and (line := self._source.readline(MOST_CHARACTERS)):
                 if len(line) >= MOST_CHARACTERS and not line.endswith("\n"):
+                    # One order too large is no reason to leave the host without a worker.
+                    while line and not line.endswith("\n"):
+                        line = self._source.readline(MOST_CHARACTERS)
                     self._fail(None, INVALID_REQUEST, "the message is too long")
-                    return
-                if line.strip() and not self._take(line):
+                elif line.strip() and not self._take(line):
                     return
         finally:
             self._queue.close()
@@ -64,9 +67,11 @@ class LineServer:
     def _take(self, line: str) -> bool:
         """Answer one line; False ends the service."""
         try:
-            message = read_json(line, 4 * MOST_CHARACTERS)
+            # A mark of the byte order is taken as in files.
+            message = read_json(line.removeprefix("\ufeff"), 4 * MOST_CHARACTERS)
         except GeometryError as error:
-            self._fail(None, PARSE_ERROR, f"not JSON ({error})")
+            told = str(error)
+            self._fail(None, PARSE_ERROR, told if "not JSON" in told else f"not JSON ({told})")
             return True
         if not (
             isinstance(message, dict)
@@ -116,9 +121,13 @@ class LineServer:
             raise UsageError("out is missing: name the folder for the result")
         # The job may be over before submit returns.
         with self._asking:
-            if ident in self._request_of.values():
-                raise UsageError(f"id {ident!r} is in use")
-            self._request_of[self._queue.submit(received).id] = ident
+            used = ident in self._request_of.values()
+            if not used:
+                self._request_of[self._queue.submit(received).id] = ident
+        if used:
+            # With the id it would be the answer to the request at work.
+            received.clean()
+            self._fail(None, INVALID_REQUEST, f"id {quote(ident)} is in use")
 
     def _cancel(self, params: Any) -> bool:
         wanted = params.get("id") if isinstance(params, dict) else None
@@ -162,9 +171,9 @@ class LineServer:
             try:
                 self._sink.write(text + "\n")
                 self._sink.flush()
-            except (BrokenPipeError, ValueError):
-                # The host is gone; the end of the input tells the rest.
-                return
+            except (OSError, ValueError):
+                # The host is gone: nobody would hear of anything done after this line.
+                self._gone.set()
 
 
 def _is_id(value: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import queue
@@ -12,7 +13,7 @@ import threading
 import pytest
 
 from gcar_deploy.worker.folder import AllowedFolder
-from gcar_deploy.worker.stdio import LineServer
+from gcar_deploy.worker.stdio import MOST_CHARACTERS, LineServer
 
 
 class Pipe:
@@ -125,6 +126,38 @@ def test_messages_that_are_not_understood(make_queue, line, code):
     assert answer["error"]["code"] == code
     assert answer["id"] == (None if code in (-32700, -32600) else 1)
     host.end()
+
+
+def test_a_line_too_long_is_passed_over(make_queue):
+    to, back = io.StringIO(), io.StringIO()
+    to.write('{"jsonrpc": "2.0", "id": 1, "x": "' + 3 * MOST_CHARACTERS * "x" + '"}\n')
+    to.write('\ufeff{"jsonrpc": "2.0", "id": 2, "method": "health"}\n')
+    to.seek(0)
+    LineServer(lambda tell: make_queue(on_change=tell), None, to, back).run()
+    first, second = map(json.loads, back.getvalue().splitlines())
+    assert first["id"] is None and first["error"]["code"] == -32600
+    assert second["id"] == 2 and second["result"]["status"] == "ok"
+
+
+def test_an_id_at_work_is_not_answered_for_another(make_queue, case_folder, tmp_path, gate):
+    gate.clear()
+    host = Host(make_queue)
+    for name in ("one", "two"):
+        host.send(1, "reconstruct", **order(case_folder, tmp_path / name))
+    assert "id 1 is in use" in host.answer(None)["error"]["message"]
+    host.send(2, "cancel", id=1)
+    assert host.answer(1)["error"]["code"] == 7
+    host.end()
+
+
+def test_a_host_that_no_longer_listens_ends_the_worker(make_queue):
+    class Full(io.StringIO):
+        def write(self, _):
+            raise OSError(28, "no space")
+
+    to = io.StringIO(2 * '{"jsonrpc": "2.0", "id": 2, "method": "health"}\n')
+    LineServer(lambda tell: make_queue(on_change=tell), None, to, Full()).run()
+    assert len(to.readlines()) == 1  # what followed is nobody's order any more
 
 
 def test_notifications_are_never_answered(make_queue, case_folder, tmp_path, gate):
