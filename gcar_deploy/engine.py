@@ -191,6 +191,10 @@ class Engine:
         cancel: Callable[[], bool] | None,
         on_step: OnStep | None,
     ) -> Result:
+        called = {"on_progress": on_progress, "cancel": cancel, "on_step": on_step}
+        for key, given in called.items():
+            if given is not None and not callable(given):
+                raise UsageError(f"{key} is a {type(given).__name__}; give a function")
         watch = Stopwatch((), deadline_s=task.deadline_s, cancel=cancel)
         options = task.options
         check_options(options)

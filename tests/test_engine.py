@@ -304,6 +304,13 @@ def test_wrong_calls(case, engine, tmp_path):
         Engine(tmp_path / "none.onnx")
 
 
+def test_what_is_no_function_is_said_before_any_work(case, engine):
+    angiograms, grid, _ = case
+    for key in ("cancel", "on_progress", "on_step"):
+        with pytest.raises(UsageError, match=f"{key} is a int; give a function"):
+            engine.reconstruct(angiograms, grid, **{key: 3})
+
+
 def test_no_path_and_the_empty_one_name_nothing(case, engine, tmp_path, monkeypatch):
     """``Path("")`` is the working folder, whose pictures would be taken for a run."""
     angiograms, grid, scene = case

@@ -16,6 +16,7 @@ from gcar_deploy.config import DicomLimits, Landmark
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import digest_of, text_of
+from gcar_deploy.geometry.fields import quote
 from gcar_deploy.inputs.order import Order, check_view_numbers, load_order
 from gcar_deploy.inputs.words import VIEW_NUMBER, parse_frames, parse_landmark
 
@@ -103,7 +104,7 @@ def _view_columns(table: Path, names: Any) -> list[str]:
     unknown = {name for name in names if not _MASK.fullmatch(name)}
     unknown -= {"case", "geom", "order", *views, *COLUMNS}
     if unknown:
-        raise UsageError(f"{table.name}: unknown column {sorted(unknown)[0]!r}")
+        raise UsageError(f"{table.name}: unknown column {quote(sorted(unknown)[0])}")
     return views
 
 

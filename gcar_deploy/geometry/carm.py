@@ -57,7 +57,7 @@ def _in_range(key: str, value: Any, unit_suffix: str = "") -> float:
     number = value if isinstance(value, (int, float)) else float(value)
     if not math.isfinite(number) or not low <= number <= high:
         raise GeometryError(
-            f"{key}{unit_suffix} = {number:g} {unit} is outside {low:g} .. {high:g} {unit}"
+            f"{key}{unit_suffix} = {number:.12g} {unit} is outside {low:g} .. {high:g} {unit}"
         )
     return number
 

@@ -26,6 +26,10 @@ def quote(value: Any) -> str:
     return text if len(text) <= MAX_QUOTE else text[:MAX_QUOTE] + " ..."
 
 
+class _NoNumber(str):
+    """NaN or Infinity, until the key that it stands under is known."""
+
+
 def read_json(text: str, max_bytes: int = MAX_BYTES) -> Any:
     """Parse JSON strictly: no NaN, Infinity or repeated keys, at most ``max_bytes``.
 
@@ -34,21 +38,30 @@ def read_json(text: str, max_bytes: int = MAX_BYTES) -> Any:
     GeometryError
     """
 
-    def refuse(token: str) -> Any:
-        raise GeometryError(f"{token} is not a number in JSON")
+    def refuse(value: Any, where: str = "") -> None:
+        waiting = [value]
+        while waiting:
+            one = waiting.pop()
+            if isinstance(one, list):
+                waiting += one
+            elif isinstance(one, _NoNumber):
+                raise GeometryError(f"{where}{one} is not a number in JSON")
 
     def pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for key, value in items:
             if key in out:
                 raise GeometryError(f"key {quote(key)} stands twice")
+            refuse(value, f"{quote(key)[1:-1]}: ")
             out[key] = value
         return out
 
     if len(text.encode("utf-8", "replace")) > max_bytes:
         raise GeometryError(f"larger than {max_bytes // 1024} KiB")
     try:
-        return json.loads(text, parse_constant=refuse, object_pairs_hook=pairs)
+        found = json.loads(text, parse_constant=_NoNumber, object_pairs_hook=pairs)
+        refuse(found)
+        return found
     except json.JSONDecodeError as error:
         raise GeometryError(f"not JSON: {error.msg} at line {error.lineno}") from None
     except RecursionError:

@@ -189,10 +189,13 @@ def _needed(segmenter: Segmenter | None) -> Segmenter:
     return segmenter
 
 
+def _file(angiogram: Angiogram) -> str:
+    return f" ({angiogram.file})" if angiogram.file else ""
+
+
 def _nothing(angiogram: Angiogram, reason: str) -> RefusedError:
-    file = f" ({angiogram.file})" if angiogram.file else ""
     return RefusedError(
-        f"no vessel found in view {angiogram.view_id}{file}: {reason}; "
+        f"no vessel found in view {angiogram.view_id}{_file(angiogram)}: {reason}; "
         "check the picture and its intensity kind and polarity"
     )
 
@@ -271,7 +274,7 @@ def _refuse_dark(angiogram: Angiogram) -> None:
     kind = angiogram.intensity.kind
     if angiogram.intensity.polarity == "dark":
         raise GeometryError(
-            f"view {angiogram.view_id}: {kind} pictures have bright vessels, "
+            f"view {angiogram.view_id}{_file(angiogram)}: {kind} pictures have bright vessels, "
             "polarity dark contradicts that; use kind raw or invert the picture"
         )
 

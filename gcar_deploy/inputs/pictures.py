@@ -73,7 +73,14 @@ def prepare(
     elif isinstance(geometry, Grid):
         angiograms, grid, notes = _in_memory(views), geometry, []
     else:
-        angiograms, grid, notes = _by_scene(views, _scene(geometry), options, check)
+        scene = _scene(geometry)
+        if len(scene.views) != len(views):
+            file = f"{Path(geometry).name}: " if isinstance(geometry, (str, Path)) else ""
+            raise GeometryError(
+                f"{file}{len(views)} pictures are given, but the geometry has "
+                f"{len(scene.views)} views"
+            )
+        angiograms, grid, notes = _by_scene(views, scene, options, check)
     angiograms = [
         dataclasses.replace(one, file=Path(view).name) if isinstance(view, (str, Path)) else one
         for one, view in zip(angiograms, views, strict=True)
@@ -190,10 +197,6 @@ def _by_scene(
     check: Callable[[], None] | None,
 ) -> tuple[list[Angiogram], Grid, list[str]]:
     """Pictures of any kind, each with the view of its place."""
-    if len(scene.views) != len(views):
-        raise GeometryError(
-            f"{len(views)} pictures are given, but the geometry has {len(scene.views)} views"
-        )
     angiograms, headers = [], {}
     runs = find_runs(views, options, scene, check)
     notes = [*scene.warnings, *_unused(options.dicom, any_run=bool(runs.wanted))]
@@ -342,12 +345,19 @@ def _unmasked(name: str, array: np.ndarray) -> np.ndarray:
     return np.asarray(array)
 
 
+def _of_numpy(value: object) -> Any:
+    """Say what numpy's numbers and arrays are in JSON."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} is no JSON value")
+
+
 def _scene(geometry: Geometry) -> Scene:
     if isinstance(geometry, Scene):
         return geometry
     if isinstance(geometry, Mapping):
         try:
-            return parse_scene(json.dumps(dict(geometry)), "geometry")
+            return parse_scene(json.dumps(dict(geometry), default=_of_numpy), "geometry")
         except (TypeError, ValueError) as error:
             raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
     if isinstance(geometry, str) and geometry.lstrip().startswith("{"):

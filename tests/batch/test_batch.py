@@ -326,6 +326,7 @@ def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
         ("case,geom,view1\na,g,1\n", "'view1' and 'view2'"),
         ("case,geom,view1,view2\n", "0 cases"),
         ("case,geom,view1,view2,extra\na,g,1,2,3\n", "unknown column 'extra'"),
+        (f"case,geom,view1,view2,{'x' * 5000}\na,g,1,2,3\n", f"'{'x' * 79} ..."),
         ("case,geom,view1,view2\na,g,1,2,3\n", "more fields"),
         ("case,geom,view1,view2\n../a,g,1,2\n", "line 2: case '../a'"),
         ("case,geom,view1,view2\nrows,g,1,2\n", "'rows'"),

@@ -89,6 +89,11 @@ def same_picture(folder: Path) -> None:
     shutil.copy(folder / "view1.png", folder / "view2.png")
 
 
+def both_blank(folder: Path) -> None:
+    picture(np.zeros_like)(folder)
+    shutil.copy(folder / "view2.png", folder / "view1.png")
+
+
 def a_folder(folder: Path) -> None:
     (folder / "view2.png").unlink()
     (folder / "view2.png").mkdir()
@@ -138,7 +143,19 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "a list": (text("[]"), 4, "object"),
     "nested deeply": (text("[" * 20000), 4, "geom.json"),
     "huge geometry": (text(" " * 100_000), 4, "larger"),
-    "NaN": (text('{"schema": NaN}'), 4, NAN),
+    "NaN": (text('{"schema": NaN}'), 4, "schema: " + NAN),
+    "NaN in a list": (text('{"views": [1, [[2], [NaN]]]}'), 4, "views: " + NAN),
+    "NaN alone": (text("[NaN]"), 4, "json: " + NAN),
+    "angle a little too large": (
+        geometry(("views.0.primary_angle_deg", 180.0001)), 4, "= 180.0001 deg is outside",
+    ),
+    "no view for a picture": (
+        lambda folder: geometry(
+            ("views", [{**json.loads((folder / "geom.json").read_text())["views"][0], "id": str(k),
+                        "primary_angle_deg": 30 * k} for k in range(3)])
+        )(folder),
+        4, "geom.json: 2 pictures are given, but the geometry has 3 views",
+    ),
     "key twice": (text('{"schema": 1, "schema": 2}'), 4, "twice"),
     "wrong schema": (geometry(("schema", "gcar-geometry/2")), 4, "schema"),
     "RAS frame": (geometry(("frame", "RAS")), 4, "frame"),
@@ -180,7 +197,7 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "unknown polarity": (geometry(("views.0.intensity.polarity", "inverse")), 4, "polarity"),
     "no scale": (geometry(("views.0.intensity.mm_per_count", ...)), 4, "mm_per_count"),
     "scale zero": (geometry(("views.0.intensity.mm_per_count", 0)), 4, "mm_per_count"),
-    "dark path lengths": (geometry(("views.0.intensity.polarity", "dark")), 4, "polarity"),
+    "dark path lengths": (geometry(("views.0.intensity.polarity", "dark")), 4, "(view1.png): "),
     "dark mask": (
         geometry(("views.0.intensity", {"kind": "mask", "polarity": "dark"})), 4, "polarity",
     ),
@@ -202,6 +219,7 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "empty mask": (mask(np.zeros_like), 6, "no vessel"),
     "full mask": (mask(nearly_full), 6, "(view2.png): nearly every pixel"),
     "mask of one pixel": (mask(speckle), 6, "mm of line"),
+    "both views blank": (both_blank, 6, "no vessel found in view 1 (view1.png)"),
     "both views the same picture": (same_picture, 6, "same picture"),
     "3 degrees apart": (
         geometry(("views.1.primary_angle_deg", -27), ("views.1.secondary_angle_deg", -20)),
@@ -307,7 +325,6 @@ EMPTY: dict[str, tuple[list[str], int, str]] = {
     "folder": (["run", "V", "W", "--geom", "G", "--out", ""], 2, "--out"),
     "model": (["run", "V", "W", "--geom", "G", "--out", "O", "--model", ""], 5, "--model"),
     "order": (["run", "--order", "", "--out", "O"], 2, "--order"),
-    "mask": (["run", "V", "W", "--geom", "G", "--out", "O", "--mask1", ""], 3, "--mask1"),
     "validate": (["validate", "V", "", "--geom", "G"], 3, "view 2 "),
     "frames": (["frames", "", "W"], 3, "view 1 "),
     "enhance": (["enhance", "", "--out", "O"], 3, "view 1 "),

@@ -10,7 +10,7 @@ import pytest
 
 from gcar_deploy.config import DicomOptions, PredictOptions, RunOptions
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import GcarError, ImageError, UsageError
+from gcar_deploy.errors import GcarError, GeometryError, ImageError, UsageError
 from gcar_deploy.inputs.pictures import prepare
 from tests.cli.conftest import geometry, good_case  # noqa: F401 - a fixture
 
@@ -101,3 +101,18 @@ def test_folders_of_dicom_files_say_what_to_name(tmp_path):
     shutil.rmtree(folders[0])
     with pytest.raises(GcarError):
         prepare(folders, geometry(), RunOptions())
+
+
+def test_a_geometry_of_numpys_numbers_is_taken():
+    plain, pixels = geometry(), [np.zeros((96, 96), np.uint8)] * 2
+    wanted, _, _ = prepare(pixels, plain, RunOptions())
+    told = geometry()
+    for view in told["views"]:
+        view["primary_angle_deg"] = np.float32(view["primary_angle_deg"])
+        view["rows"] = np.int64(view["rows"])
+        view["pixel_spacing_mm"] = np.array(view["pixel_spacing_mm"])
+    found, _, _ = prepare(pixels, told, RunOptions())
+    assert [a.carm for a in found] == [a.carm for a in wanted]
+    told["views"][0]["rows"] = np.True_
+    with pytest.raises(GeometryError, match="rows = True"):
+        prepare(pixels, told, RunOptions())
