@@ -129,9 +129,14 @@ def test_too_much_vessel_is_refused_before_the_views_are_placed(case, monkeypatc
 
 
 def test_run_refuses_a_tree_longer_than_any(case):
-    options = RunOptions(quality=QualityOptions(max_length_mm=60.0))
+    engine = Engine(threads=1, options=RunOptions(quality=QualityOptions(max_length_mm=60.0)))
+    assert engine.reconstruct(*files(case)).tree.length_mm > 60.0  # true path lengths are believed
+    told = json.loads((case / "geom.json").read_text())
+    for view in told["views"]:
+        view["intensity"] = {"kind": "attenuation"}
+    (case / "geom.json").write_text(json.dumps(told))
     with pytest.raises(RefusedError, match="more than any coronary tree has"):
-        Engine(threads=1, options=options).reconstruct(*files(case))
+        engine.reconstruct(*files(case))
 
 
 def test_a_volume_beside_the_tree_is_refused_in_the_words_of_run(case):

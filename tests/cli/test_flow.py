@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from tests.cli.conftest import gcar
-from tests.output.conftest import folder, result  # noqa: F401 - fixtures
+from tests.output.conftest import folder  # noqa: F401 - a fixture
 
 
 @pytest.fixture
