@@ -108,6 +108,11 @@ class Angiogram:
             sha256=sha256,
         )
 
+    @property
+    def label(self) -> str:
+        """Which view it is, and of which file: for messages."""
+        return f"view {self.view_id} ({self.file})" if self.file else f"view {self.view_id}"
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class VesselImage:

@@ -189,13 +189,9 @@ def _needed(segmenter: Segmenter | None) -> Segmenter:
     return segmenter
 
 
-def _file(angiogram: Angiogram) -> str:
-    return f" ({angiogram.file})" if angiogram.file else ""
-
-
 def _nothing(angiogram: Angiogram, reason: str) -> RefusedError:
     return RefusedError(
-        f"no vessel found in view {angiogram.view_id}{_file(angiogram)}: {reason}; "
+        f"no vessel found in {angiogram.label}: {reason}; "
         "check the picture and its intensity kind and polarity"
     )
 
@@ -274,7 +270,7 @@ def _refuse_dark(angiogram: Angiogram) -> None:
     kind = angiogram.intensity.kind
     if angiogram.intensity.polarity == "dark":
         raise GeometryError(
-            f"view {angiogram.view_id}{_file(angiogram)}: {kind} pictures have bright vessels, "
+            f"{angiogram.label}: {kind} pictures have bright vessels, "
             "polarity dark contradicts that; use kind raw or invert the picture"
         )
 

@@ -31,8 +31,7 @@ def refuse_thin(angiogram: Angiogram, mask: Mask) -> None:
         return
     wide = int(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _SQUARE).sum())
     if wide <= MOST_SQUARES * count:
-        file = f" ({angiogram.file})" if angiogram.file else ""
         raise RefusedError(
-            f"view {angiogram.view_id}{file}: the mask's lines are one pixel wide; "
+            f"{angiogram.label}: the mask's lines are one pixel wide; "
             "a mask (kind mask) has to show the vessels as wide as they are in the picture"
         )
