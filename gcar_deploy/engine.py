@@ -65,7 +65,8 @@ class Engine:
             check_number("threads", threads, int, Range(1, 256))
         self.threads = threads or min(os.cpu_count() or 1, 4)
         for key, given in (("model", model), ("segmenter_model", segmenter_model)):
-            _check_model(key, given)
+            if given is not None:
+                path_of(given, key, ModelError if isinstance(given, str) else UsageError)
         wanted = self.options.predict
         self._predictor = load_predictor(model, wanted, threads=self.threads, session=session)
         self._segmenter: Segmenter | None = None
@@ -217,17 +218,6 @@ class Engine:
                 on_step=on_step,
             )
         return Result.of(found, (*notes, *missing, *found.notes))
-
-
-def _check_model(key: str, given: object) -> None:
-    """Refuse what is no path, and the empty one, which would be the working folder."""
-    if given is None:
-        return
-    try:
-        path_of(given)
-    except ValueError as error:
-        kind = ModelError if isinstance(given, str) else UsageError
-        raise kind(f"{key} {error}") from None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -86,20 +86,20 @@ def frames_in(folder: Path) -> list[Path]:
     return sorted((p for p in files if p.suffix.lower() in _FRAMES), key=natural_order)
 
 
-def path_of(value: object) -> Path:
+def path_of(value: object, what: str, error: type[Exception]) -> Path:
     """Return what names a file or folder; empty text does not, though ``Path`` takes it for ".".
 
     Raises
     ------
-    ValueError
-        As ``read_bounded``.
+    error
+        The sentence begins with ``what``.
     """
     if not isinstance(value, (str, os.PathLike)):
-        raise ValueError(f"is a {type(value).__name__}; give a path")
+        raise error(f"{what} is a {type(value).__name__}; give a path")
     if not os.fspath(value):
-        raise ValueError("is empty text; name a file or folder")
+        raise error(f"{what} is empty text; name a file or folder")
     if "\0" in os.fsdecode(value):
-        raise ValueError(f"{os.fsdecode(value)!r} holds a NUL character, which no name has")
+        raise error(f"{what} {os.fsdecode(value)!r} holds a NUL character, which no name has")
     return Path(value)
 
 

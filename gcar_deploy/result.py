@@ -32,8 +32,5 @@ class Result(Reconstruction):
         # Whoever does not save need not load what only writers need.
         from gcar_deploy.output.bundle import write_result
 
-        try:
-            folder = path_of(out_dir)
-        except ValueError as error:
-            raise UsageError(f"out_dir {error}") from None
+        folder = path_of(out_dir, "out_dir", UsageError)
         return write_result(self, folder, force=force, extras=extras)

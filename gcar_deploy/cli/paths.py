@@ -31,11 +31,9 @@ class NamedPath(click.Path):
         ctx: click.Context | None,
     ) -> Any:
         """Return the path."""
-        try:
-            path_of(value)
-        except ValueError as error:
-            what = param.opts[0] if isinstance(param, click.Option) else "the path"
-            raise self._error(f"{what} {error}") from None
+        path_of(
+            value, param.opts[0] if isinstance(param, click.Option) else "the path", self._error
+        )
         return super().convert(value, param, ctx)
 
 
@@ -58,10 +56,5 @@ def _numbered(
 ) -> Any:
     """Turn text into paths; an empty one is told by the number of its view."""
     texts = (given,) if isinstance(given, str) else given or ()
-    for number, text in enumerate(texts, start=1):
-        try:
-            path_of(text)
-        except ValueError as error:
-            raise ImageError(f"view {number} {error}") from None
-    paths = tuple(Path(text) for text in texts)
+    paths = tuple(path_of(text, f"view {k}", ImageError) for k, text in enumerate(texts, start=1))
     return paths[0] if isinstance(given, str) else paths

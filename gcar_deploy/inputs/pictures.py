@@ -15,6 +15,7 @@ from gcar_deploy.config import DicomOptions, ImagingOptions, PictureLimits, RunO
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, check_origin, read_run, read_views
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
+from gcar_deploy.files import path_of
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
@@ -105,8 +106,8 @@ def _check_kinds(views: Sequence[Picture]) -> None:
                 f"view {number} is a {type(view).__name__}; give a path, an array of counts or an "
                 "Angiogram"
             )
-        if isinstance(view, str) and not view:
-            raise ImageError(f"view {number} is empty text; name a file or folder")
+        if isinstance(view, str):
+            path_of(view, f"view {number}", ImageError)
 
 
 def _check_masks(masks: Mapping[int, Mask]) -> None:
@@ -118,8 +119,8 @@ def _check_masks(masks: Mapping[int, Mask]) -> None:
             raise UsageError(f"masks has a {type(number).__name__} as a key; {how}")
         if not isinstance(mask, (str, Path, np.ndarray)):
             raise UsageError(f"mask {number} is a {type(mask).__name__}; {how}")
-        if isinstance(mask, str) and not mask:
-            raise ImageError(f"mask {number} is empty text; name a file")
+        if isinstance(mask, str):
+            path_of(mask, f"mask {number}", ImageError)
 
 
 def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
@@ -362,8 +363,6 @@ def _scene(geometry: Geometry) -> Scene:
             raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
     if isinstance(geometry, str) and geometry.lstrip().startswith("{"):
         raise UsageError("geometry is JSON text; give a path, or json.loads of it")
-    if geometry == "":
-        raise GeometryError("geometry is empty text; name a file")
     if isinstance(geometry, (str, Path)):
-        return load_scene(geometry)
+        return load_scene(path_of(geometry, "geometry", GeometryError))
     raise UsageError(f"geometry is a {type(geometry).__name__}; give a path, dict or Scene")
