@@ -96,6 +96,21 @@ def narrowest(share: Scalars, among: Array) -> list[tuple[int, int, int]]:
     return [(k, *_borders(share, k, found)) for k in found]
 
 
+def slightest(share: Scalars, searched: Array, again: Array) -> int:
+    """Section of the most severe narrowing of a branch without a lesion.
+
+    Not the narrowest point, which may just be the thin far end; nor, unless there is nothing else,
+    what a taper ends in. ``searched`` (m,) bool, where it is looked for; ``again`` as ``recovers``.
+    """
+    k = int(np.argmin(np.where(searched, share, np.inf)))
+    if share[k] >= 1 - LESION_SHARE or again[k]:
+        return k
+    known = searched & (again | (share >= 1))
+    if not known.any():
+        known = searched & (share == share[searched].max())
+    return int(np.argmin(np.where(known, share, np.inf)))
+
+
 def _borders(share: Scalars, k: int, others: Sequence[int]) -> tuple[int, int]:
     """Sections at which the lesion round section ``k`` begins and ends."""
     first = last = k

@@ -18,6 +18,7 @@ from gcar_deploy.measure.lesions import (
     lesion_at,
     narrowest,
     recovers,
+    slightest,
 )
 from gcar_deploy.measure.reference import reference_lines
 from gcar_deploy.measure.sections import Sections, sections_of_radii
@@ -144,23 +145,17 @@ def _lumen(
     inner = (arc_mm >= low) & (arc_mm <= high)
     healthy[inner] = np.interp(arc_mm[inner], own.arc_mm, line)
     share = own.diameter_mm / line
-    # The most severe narrowing, not the narrowest point, which may just be the thin far end.
-    k = int(np.argmin(np.where(searched, share, np.inf)))
     again = recovers(own, line, clear, beyond)
-    if marked is None and share[k] < 1 - LESION_SHARE and not again[k]:
-        # What a taper ends in is no stenosis: the most severe narrowing of the others is.
-        known = searched & (again | (share >= 1))
-        if not known.any():
-            known = searched & (share == share[searched].max())
-        k = int(np.argmin(np.where(known, share, np.inf)))
-    spots = narrowest(share, searched & again)
-    if marked is not None:
-        first, last = np.flatnonzero(searched)[[0, -1]]
-        spots = [(k, int(first), int(last))]
+    if marked is None:
+        spots = narrowest(share, searched & again)
+        k, first, last = spots[0] if spots else (slightest(share, searched, again),) * 3
+    else:
+        first, last = np.flatnonzero(searched)[[0, -1]].tolist()
+        k = int(np.argmin(np.where(searched, share, np.inf)))
+        spots = [(k, first, last)]
     for_good = clear & ~again & (share < 1 - LESION_SHARE)
-    for _, first, last in spots:
-        for_good[first : last + 1] = False
-    k, first, last = spots[0] if spots else (k, k, k)
+    for _, begin, end in spots:
+        for_good[begin : end + 1] = False
     least = float(min(share[k], 1.0))
     spans = np.gradient(own.arc_mm)
     return BranchLumen(
