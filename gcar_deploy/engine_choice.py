@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 class EngineChoice:
     """Which engine does the work: model files (None for the shipped ones) and threads."""
 
-    model: str | None = None
+    model: Path | None = None
     threads: int | None = None
-    segmenter_model: str | None = None
+    segmenter_model: Path | None = None
 
     @property
     def files(self) -> dict[str, Path]:
         """Return the model files that are named, each by its role."""
         named = {"model": self.model, "segmenter_model": self.segmenter_model}
-        return {role: Path(file) for role, file in named.items() if file is not None}
+        return {role: file for role, file in named.items() if file is not None}
 
     def absolute(self) -> EngineChoice:
         """Return the choice with its files by their full paths."""
-        full = {role: str(file.absolute()) for role, file in self.files.items()}
+        full = {role: file.absolute() for role, file in self.files.items()}
         return EngineChoice(full.get("model"), self.threads, full.get("segmenter_model"))
 
     def limit_threads(self) -> None:

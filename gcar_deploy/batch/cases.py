@@ -42,7 +42,7 @@ class BatchCase:
         """SHA-256 of everything the result depends on; unreadable files count as absent."""
         order = self.order.with_files(lambda _, path: Path(path.name))
         what = {"order": order.to_dict(), "engine": dataclasses.asdict(engine)}
-        digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps(what, sort_keys=True, default=str).encode())
         for name, path in {**self.order.files, **engine.files}.items():
             content = digest_of(path, _LIMITS.max_bytes, _LIMITS.max_frames)
             digest.update(name.encode() + b"\0" + content)

@@ -71,7 +71,7 @@ def estimate_jointly(
     Returns
     -------
     theta : (V, 5) corrections; ``first`` where fewer than three pairs can be compared, where
-        there are more views than ``MOST_VIEWS`` (the cost grows with their cube), where all
+        there are more views than ``MOST_JOINT_VIEWS`` (the cost grows with their cube), where all
         pairs agree as they are told, or where they do not agree better after the joint fit
     converged : bool, False where the joint fit stopped at its cap
     """
