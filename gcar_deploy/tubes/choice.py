@@ -144,9 +144,11 @@ def reinstated(
     targets : one per view
     left : per view (rows, cols), path that the kept pieces leave unexplained, mm
     """
-    tubes = tubes_of(tree)
-    # The points know no stenosis: a narrow vessel shows too small a share of so wide a path.
-    radius = np.minimum(start_radius, radius_alone(tubes, targets))
+    tubes, radius = tubes_of(tree), start_radius
+    if all(target.calibrated for target in targets):
+        # The points know no stenosis: a narrow vessel shows too small a share of so wide a path.
+        # Where paths are estimates they run low, and a ghost as narrow as they say comes back.
+        radius = np.minimum(radius, radius_alone(tubes, targets))
     tubes = dataclasses.replace(tubes, log_radius=np.log(radius))
     dropped = pieces.share < MIN_SHARE
     count = len(pieces.share)
