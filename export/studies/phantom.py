@@ -63,7 +63,7 @@ class Prediction:
     shift_mm : float
     share : of the run's skeleton within ``NEAR_PX`` of the reprojected centreline
     median_px : median distance of the run's skeleton from the reprojected centreline
-    back_share, back_median_px : the same of the reprojected centreline from the skeleton
+    back_share : the same of the reprojected centreline from the skeleton
     """
 
     name: str
@@ -72,7 +72,6 @@ class Prediction:
     share: float
     median_px: float
     back_share: float
-    back_median_px: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -193,13 +192,12 @@ def predict(name: str, view: VesselImage, tree: Tree) -> Prediction:
     carm = view.carm.moved(shift)
     line = centreline_mask(tree, carm)
     if not (line.any() and seen.any()):
-        return Prediction(name, carm, float(np.linalg.norm(shift)), 0.0, np.inf, 0.0, np.inf)
+        return Prediction(name, carm, float(np.linalg.norm(shift)), 0.0, np.inf, 0.0)
     gap, back = distance_px(line)[seen], distance_px(seen)[line & view.valid]
     return Prediction(
         name, carm, float(np.linalg.norm(shift)),
         float((gap <= NEAR_PX).mean()), float(np.median(gap)),
         float((back <= NEAR_PX).mean()) if len(back) else 0.0,
-        float(np.median(back)) if len(back) else np.inf,
     )  # fmt: skip
 
 

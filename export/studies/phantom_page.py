@@ -25,22 +25,25 @@ def markdown(fits: Sequence[Fit]) -> str:
     """One row a set of runs: the runs that were not fitted, and the authors' surface."""
     out = [
         "| fitted | status | " + " | ".join(RUNS) + " | mean % | tree on skeleton % | tree mm "
-        "| ours to the authors' surface: median, 95 % mm | rays of landmarks apart mm |",
-        "|---" * (len(RUNS) + 7) + "|",
+        "| ours to the authors' surface: median, 95 % mm | theirs to ours "
+        "| rays of landmarks apart mm |",
+        "|---" * (len(RUNS) + 8) + "|",
     ]
     for one in fits:
         if one.result is None:
-            out.append(f"| {_name(one)} | refused |" + " - |" * (len(RUNS) + 5))
+            out.append(f"| {_name(one)} | refused |" + " - |" * (len(RUNS) + 6))
             continue
         shares = {p.name: f"{100 * p.share:.0f}" for p in one.predictions}
         back = np.mean([p.back_share for p in one.predictions])
-        near = "-" if one.surface is None else (
-            f"{one.surface.ours_median:.2f}, {one.surface.ours_95:.2f}"
+        gap = one.surface
+        near = ("-", "-") if gap is None else (
+            f"{gap.ours_median:.2f}, {gap.ours_95:.2f}",
+            f"{gap.theirs_median:.2f}, {gap.theirs_95:.2f}",
         )  # fmt: skip
         cells = [
             _name(one), one.result.status, *(shares.get(name, "fitted") for name in RUNS),
             f"{100 * _mean_share(one):.0f}", f"{100 * back:.0f}",
-            f"{one.result.tree.length_mm:.0f}", near,
+            f"{one.result.tree.length_mm:.0f}", *near,
             "-" if one.marks_mm is None else f"{one.marks_mm:.2f}",
         ]  # fmt: skip
         out.append("| " + " | ".join(cells) + " |")
