@@ -17,6 +17,8 @@ from gcar_deploy.geometry.carm import CArm
 _GOOD_TILT_DEG, _MAX_TILT_DEG = 0.1, 1.0
 #: share by which SDD / SOD may differ from the file's own magnification factor
 _MAGNIFICATION_SHARE = 0.02
+#: share by which a given spacing may differ from that of the field of view, told in whole mm
+_FIELD_SHARE = 0.1
 _WAY_OUT = "give the geometry with --geom"
 
 
@@ -197,10 +199,33 @@ def _spacing(
             f"give it with --pixel-spacing MM (pixel_spacing_mm of an order){why}"
         )
     if own is None:
+        _check_field(header, frame, float(given or 0.0), notes)
         return float(given or 0.0), float(given or 0.0)
     if given is not None and max(abs(x / given - 1.0) for x in own) > 1e-3:
         notes.append(f"says {own[0]:g} mm pixel spacing itself; --pixel-spacing is not used for it")
     return own
+
+
+def _check_field(header: Header, frame: int, given: float, notes: list[str]) -> None:
+    """Note a given spacing that is at odds with the size of the field that the file tells.
+
+    Only a rectangle's: a round field need not fill the picture, which says nothing of its pixels.
+    """
+    try:
+        told = header.numbers("FieldOfViewDimensions", frame) or ()
+    except GeometryError:  # no geometry hangs on it
+        return
+    if len(told) != 2 or header.text("FieldOfViewShape", frame) != "RECTANGLE" or min(told) <= 0:
+        return
+    sides = ("rows", told[0], header.rows), ("columns", told[1], header.columns)
+    for name, size, count in sides:
+        spacing = size / count
+        if abs(given / spacing - 1.0) > _FIELD_SHARE:
+            notes.append(
+                f"--pixel-spacing {given:g} mm is at odds with {tag('FieldOfViewDimensions')}: "
+                f"{size:g} mm over {count} {name} are {spacing:.3g} mm each"
+            )
+            return
 
 
 def _check_tilt(header: Header, frame: int, notes: list[str]) -> None:

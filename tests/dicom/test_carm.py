@@ -68,6 +68,23 @@ def test_options_supply_what_is_missing_and_nothing_else(carm):
     assert len(notes) == 2 and all("not used" in note for note in notes)
 
 
+def test_a_given_spacing_is_held_against_the_field_of_view(carm):
+    """204 mm over 128 rows are 1.6 mm each."""
+    field = {"FieldOfViewShape": "RECTANGLE", "FieldOfViewDimensions": ["204", "204"]}
+
+    def notes(given, **changes):
+        options = DicomOptions(pixel_spacing_mm=given)
+        return carm(options=options, ImagerPixelSpacing=None, **{**field, **changes})[1]
+
+    (said,) = notes(1.2)
+    assert "--pixel-spacing 1.2 mm" in said and f"204 mm over {SIDE} rows are" in said
+    assert f"are {204 / SIDE:.3g} mm each" in said
+    assert not notes(0.95 * 204 / SIDE)
+    assert not notes(1.2, FieldOfViewShape="ROUND", FieldOfViewDimensions=["204"])
+    assert not notes(1.2, FieldOfViewDimensions=None)
+    assert not notes(1.2, FieldOfViewDimensions=["0", "0"])
+
+
 def test_a_calibrated_spacing_is_never_the_detectors(carm):
     with pytest.raises(GeometryError, match="no substitute"):
         carm(ImagerPixelSpacing=None, PixelSpacing=["0.3", "0.3"])
