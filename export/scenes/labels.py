@@ -29,6 +29,11 @@ from gcar_export.scenes.label_formats import read_metaimage, read_nrrd
 ASOCA_NPZ_SPACING_MM = 180.0 / 128
 #: an affine this far (relative) from axis-parallel is resampled instead of relabelled.
 OBLIQUE_TOLERANCE = 1e-3
+#: cosine of the angle between two axes of a file from which on they are sheared
+SHEAR_TOLERANCE = 0.01
+#: a volume with more vessel than the first share is no label of vessels; nor is one with more than
+#: the second whose voxels have more values than any list of vessels
+MOST_VESSEL, GREY_SHARE, GREY_VALUES = 0.9, 0.2, 100
 #: empty voxels kept round the tree when a volume is cropped.
 MARGIN_VOXELS = 2
 #: a file is cropped on reading when the tree's box is a smaller share of it than this.
@@ -218,7 +223,10 @@ def read_label(path: str | Path) -> LabelVolume:
             array, affine = _read_any(path, name)
             if array.ndim != 3:
                 raise UsageError(f"{path}: a label volume has 3 axes, this has {array.ndim}")
-            label = from_array(_vessel(array, path), affine, case)
+            _refuse_sheared(affine, path)
+            vessel = _vessel(array, path)
+            _refuse_pictures(array, vessel, path)
+            label = from_array(vessel, affine, case)
     except _DAMAGE as error:
         reason = (str(error).splitlines() or [""])[0].replace(str(path), "it")[:200]
         raise UsageError(f"{path}: cannot be read ({reason or type(error).__name__})") from None
@@ -262,11 +270,36 @@ def from_array(occupancy: Array, index2ras: Array, name: str = "label") -> Label
     return LabelVolume(occupancy=np.ascontiguousarray(array), grid=grid, name=name)
 
 
+def _refuse_sheared(index2ras: Array, path: Path) -> None:
+    """Refuse axes that do not stand upright on each other: a tilted gantry, or a damaged header."""
+    directions = np.asarray(index2ras, dtype=np.float64)[:3, :3]
+    unit = directions / np.maximum(np.linalg.norm(directions, axis=0), 1e-12)
+    cosine = float(np.abs(unit.T @ unit - np.eye(3)).max(initial=0.0, where=~np.eye(3, dtype=bool)))
+    if cosine > SHEAR_TOLERANCE:
+        raise UsageError(
+            f"{path}: its axes are sheared, {np.degrees(np.arccos(min(cosine, 1.0))):.1f} deg "
+            "apart, not 90; resample it on upright axes"
+        )
+
+
+def _refuse_pictures(array: Array, vessel: Array, path: Path) -> None:
+    """Refuse what is vessel nearly everywhere, or a picture of grey values like a CT."""
+    share = float(vessel.mean())
+    grey = share > GREY_SHARE and len(np.unique(array)) > GREY_VALUES
+    if share > MOST_VESSEL or grey:
+        raise UsageError(
+            f"{path}: {share:.0%} of its voxels are above 0, which is no label of vessels"
+            + (": it holds grey values, as a CT does; label its vessels" if grey else "")
+        )
+
+
 def _vessel(array: Array, path: Path) -> Array:
     """Voxels that are vessel, bool."""
     if np.issubdtype(array.dtype, np.floating):
+        if strange := int((~np.isfinite(array)).sum()):
+            raise UsageError(f"{path}: {strange} voxels are no finite numbers")
         shares = ((array > 0) & (array < 1)).any()
-        if shares and not ((array < 0) | (array > 1)).any():  # NaN is neither
+        if shares and not ((array < 0) | (array > 1)).any():
             click.echo(f"{path} holds shares 0 .. 1: from {SHARE} on a voxel is vessel", err=True)
             return np.asarray(array >= SHARE)
     return np.asarray(array > 0)

@@ -116,6 +116,27 @@ def test_shares_are_vessel_from_a_half_on_and_this_is_said(tmp_path, capsys):
     assert not capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [("box", "100% of its voxels are above 0"), ("ct", "grey values, as a CT does"),
+     ("nan", "1 voxels are no finite numbers"), ("shear", "sheared, 71.6 deg apart")],
+)  # fmt: skip
+def test_what_is_no_label_of_vessels_is_refused_by_its_path(tmp_path, change, said):
+    array, affine = two_trees().astype(np.float32), RAS.copy()
+    if change == "box":
+        array[:] = 1
+    if change == "ct":  # an offset that makes air positive, and nothing beside the body
+        array = np.random.default_rng(0).integers(1, 2000, array.shape).astype(np.int16)
+        array[:8] = 0
+    if change == "nan":
+        array[0, 0, 0] = np.nan
+    if change == "shear":
+        affine[0, 1] = affine[1, 1] / 3
+    nibabel.save(nibabel.Nifti1Image(array, affine), tmp_path / "a.nii.gz")
+    with pytest.raises(UsageError, match=r"/a\.nii\.gz: .*" + said):
+        read_label(tmp_path / "a.nii.gz")
+
+
 def test_a_volume_of_other_axes_is_named_by_its_path(tmp_path):
     flat = np.ones((4, 4, 4, 2), np.uint8)
     nibabel.save(nibabel.Nifti1Image(flat, RAS), tmp_path / "4d2.nii.gz")
