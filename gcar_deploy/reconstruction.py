@@ -25,7 +25,7 @@ from gcar_deploy.geometry.observability import (
 )
 from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.resample import resized
+from gcar_deploy.imaging.square import on_given_pixels
 from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
@@ -169,7 +169,7 @@ class Reconstruction:
         )
         views = tuple(
             dataclasses.replace(
-                resized(self.views[p], *angiogram.pixels.shape), carm=pose.applied(angiogram.carm)
+                on_given_pixels(self.views[p], angiogram.carm), carm=pose.applied(angiogram.carm)
             )
             for p, pose, angiogram in zip(places, poses, angiograms, strict=True)
         )

@@ -33,16 +33,16 @@ def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     if (rows, columns) == vessel_image.mask.shape:
         return vessel_image
     carm = vessel_image.carm.resized(rows, columns)
-    return _averaged(vessel_image, carm, lambda picture: area_average(picture, rows, columns))
+    return averaged(vessel_image, carm, lambda picture: area_average(picture, rows, columns))
 
 
 def coarser_view(view: VesselImage, factor: int) -> VesselImage:
     """``resized`` to pixels ``factor`` times as large, which meet at the principal point."""
     carm, _ = coarsened(view.carm, (), factor)
-    return _averaged(view, carm, lambda picture: coarsened(view.carm, (picture,), factor)[1][0])
+    return averaged(view, carm, lambda picture: coarsened(view.carm, (picture,), factor)[1][0])
 
 
-def _averaged(old: VesselImage, carm: CArm, average: Callable[[Image], Image]) -> VesselImage:
+def averaged(old: VesselImage, carm: CArm, average: Callable[[Image], Image]) -> VesselImage:
     """Return the view of larger pixels that hold the ``average`` of the old ones."""
 
     def share(of: Mask) -> Image:
@@ -141,53 +141,94 @@ def coarsened(
     """
     if factor <= 1 + 1e-6:
         return carm, tuple(pictures)
+    new, down, across = stretched(carm, (1 / factor, 1 / factor))
+    return new, tuple(weighted(picture, down, across) for picture in pictures)
+
+
+def stretched(carm: CArm, scales: tuple[float, float]) -> tuple[CArm, Array, Array]:
+    """Lay other pixels over a view, ``scales`` times as many, which meet at the principal point.
+
+    Parameters
+    ----------
+    carm : CArm
+    scales : down, across; 1 leaves the pixels that way as they are
+
+    Returns
+    -------
+    carm : CArm of the new pixels; they may reach beyond the old ones' field by less than one
+    down, across : (new rows, rows), (new cols, cols) sparse, for ``weighted``: means over the area
+        of larger pixels, linear between the old pixels for smaller ones
+    """
     column, row = carm.principal_point
-    down, first_row = _cells(carm.rows, row, factor)
-    across, first_column = _cells(carm.columns, column, factor)
-    point = (-first_column - 0.5, -first_row - 0.5)
-    new = _coarser(carm, (down.shape[0], across.shape[0]), factor, point)
-    small = ((across @ (down @ picture).T).T for picture in pictures)
-    return new, tuple(np.ascontiguousarray(image, dtype=np.float32) for image in small)
+    (down, new_row), (across, new_column) = (
+        _shares(old, anchor, scale)
+        for old, anchor, scale in zip((carm.rows, carm.columns), (row, column), scales, strict=True)
+    )
+    shape = down.shape[0], across.shape[0]
+    return _on_pixels(carm, shape, scales, (new_column, new_row)), down, across
 
 
-def _coarser(carm: CArm, shape: tuple[int, int], factor: float, point: tuple[float, float]) -> CArm:
-    """View with larger pixels whose principal point is at ``point`` (col, row)."""
+def weighted(picture: Image, down: Array, across: Array) -> Image:
+    """Sum a picture's pixels with sparse weights each way, (new rows, new cols) float32."""
+    return np.ascontiguousarray((across @ (down @ picture).T).T, dtype=np.float32)
+
+
+def _on_pixels(
+    carm: CArm, shape: tuple[int, int], scales: tuple[float, float], point: tuple[float, float]
+) -> CArm:
+    """View with ``scales`` (down, across) times as many pixels, principal point (col, row)."""
     matrix = None
+    down, across = scales
     if carm.projection_matrix is not None:
         old = carm.principal_point
         S = np.array(
-            [
-                [1 / factor, 0, point[0] - old[0] / factor],
-                [0, 1 / factor, point[1] - old[1] / factor],
-                [0, 0, 1],
-            ]
-        )
+            [[across, 0, point[0] - old[0] * across], [0, down, point[1] - old[1] * down],
+             [0, 0, 1]]
+        )  # fmt: skip
         matrix = tuple(map(tuple, (S @ np.asarray(carm.projection_matrix)).tolist()))
     row_mm, column_mm = carm.pixel_spacing_mm
     return dataclasses.replace(
         carm,
         rows=shape[0],
         columns=shape[1],
-        pixel_spacing_mm=(row_mm * factor, column_mm * factor),
+        pixel_spacing_mm=(row_mm / down, column_mm / across),
         principal_point_px=point,
         projection_matrix=matrix,
     )
 
 
-def _cells(old: int, anchor: float, factor: float) -> tuple[Array, int]:
-    """Shares of old pixels in new ones whose edges lie at ``anchor`` and whole factors from it.
+def _shares(old: int, anchor: float, scale: float) -> tuple[Array, float]:
+    """Weights of old pixels in new ones whose edges lie at ``anchor`` and whole pixels from it.
 
     Returns
     -------
     weights : (new, old) sparse, rows sum to 1
-    first : number of the first new pixel, counted from the one that begins at the anchor
+    anchor : where the anchor is on the new pixels
     """
-    first = int(np.floor((-0.5 - anchor) / factor + 1e-9))
-    last = int(np.ceil((old - 0.5 - anchor) / factor - 1e-9))
-    edges = np.clip(anchor + factor * np.arange(first, last + 1), -0.5, old - 0.5)
+    if scale == 1:
+        return sparse.identity(old, format="csr"), anchor
+    first = int(np.floor((-0.5 - anchor) * scale + 1e-9))
+    last = int(np.ceil((old - 0.5 - anchor) * scale - 1e-9))
+    if scale < 1:
+        return area_shares(anchor + np.arange(first, last + 1) / scale, old), -first - 0.5
+    at = np.clip(anchor + (np.arange(first, last) + 0.5) / scale, 0, old - 1)
+    before = np.floor(at).astype(np.int64)
+    after = np.minimum(before + 1, old - 1)
+    new = np.arange(len(at))
+    weight = np.concatenate([1 - (at - before), at - before])
+    places = np.concatenate([new, new]), np.concatenate([before, after])
+    return sparse.csr_matrix((weight, places), shape=(len(at), old)), -first - 0.5
+
+
+def area_shares(edges: Array, old: int) -> Array:
+    """Share of each new pixel, between ``edges`` (new + 1,), that old ones fill, (new, old) sparse.
+
+    Rows sum to 1: what lies beyond the old pixels does not count.
+    """
+    edges = np.clip(edges, -0.5, old - 0.5)
     cuts = np.union1d(edges, np.arange(old + 1) - 0.5)
     middle = 0.5 * (cuts[:-1] + cuts[1:])
     new = np.clip(np.searchsorted(edges, middle) - 1, 0, len(edges) - 2)
     share = np.diff(cuts) / np.maximum(np.diff(edges), 1e-12)[new]
     at = np.rint(middle).astype(np.int64).clip(0, old - 1)
-    return sparse.csr_matrix((share, (new, at)), shape=(len(edges) - 1, old)), first
+    return sparse.csr_matrix((share, (new, at)), shape=(len(edges) - 1, old))

@@ -12,7 +12,7 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.own_frame import own_frame
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.own_frame import in_own_frame
-from gcar_deploy.imaging.square import square_point, square_shape, squared
+from gcar_deploy.imaging.square import square_point, squared
 from tests.hard.phantoms import (
     GRID,
     PAIR,
@@ -94,21 +94,56 @@ def test_raw_pictures_come_back_on_their_own_pixels(engine):
 def test_points_and_what_is_drawn_go_with_the_pixels(shape):
     view = carm(-30, -20, **shape)
     points = np.random.default_rng(3).uniform(-30, 30, (20, 3))
-    rows, columns = square_shape(view)
-    new = view.resized(rows, columns)
-    assert abs(new.focal_px[0] / new.focal_px[1] - 1) < 1e-9
-    for old, there in zip(view.project(points)[0], new.project(points)[0], strict=True):
-        np.testing.assert_allclose(square_point(view, tuple(old)), there, atol=1e-9)
     pixels = path_of(straight(), view)
     picture = dataclasses.replace(
         angiogram(view, pixels, "1"), mask=pixels > 0, painted=pixels > 3, bare=(pixels,)
     )
     done = squared(picture)
-    assert done.pixels.shape == done.mask.shape == done.painted.shape == (rows, columns)
+    new = done.carm
+    assert abs(new.focal_px[0] / new.focal_px[1] - 1) < 1e-9
+    for old, there in zip(view.project(points)[0], new.project(points)[0], strict=True):
+        np.testing.assert_allclose(square_point(view, tuple(old)), there, atol=1e-9)
+    shapes = {one.shape for one in (done.pixels, done.mask, done.painted, *done.bare)}
+    assert shapes == {(new.rows, new.columns)}
     off = done.pixels - path_of(straight(), new)
     assert np.sqrt((off[done.mask] ** 2).mean()) < 0.4
     # the same millimetres of vessel over the field
     assert done.pixels.sum() == pytest.approx(2 * pixels.sum(), rel=1e-3)
+
+
+@pytest.mark.parametrize("border", [(5, 3), (0, 1), (17, 40)])
+@pytest.mark.parametrize("shape", [TALL, WIDE, {"principal_point_px": (50.3, 81.7)} | TALL])
+def test_a_border_more_leaves_the_pixels_where_they_were(shape, border):
+    view = carm(-30, -20, **shape)
+    pixels = path_of(straight(), view)
+    top, left = border
+    column, row = view.principal_point
+    wider = dataclasses.replace(
+        view, rows=view.rows + top, columns=view.columns + left,
+        principal_point_px=(column + left, row + top),
+    )  # fmt: skip
+    first = squared(angiogram(view, pixels, "1"))
+    second = squared(angiogram(wider, np.pad(pixels, ((top, 0), (left, 0))), "1"))
+    more = np.subtract(second.pixels.shape, first.pixels.shape)
+    inside = second.pixels[more[0] :, more[1] :]
+    # The first pixels may reach beyond the picture, where it goes on as at its edge.
+    np.testing.assert_allclose(inside[2:, 2:], first.pixels[2:, 2:], atol=1e-5)
+    offset = np.subtract(second.carm.principal_point, first.carm.principal_point)
+    np.testing.assert_allclose(offset, more[::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [TALL, WIDE, {"principal_point_px": (50.3, 81.7)} | TALL])
+def test_what_was_found_comes_back_on_the_pixels_that_were_given(engine, shape):
+    tree, taken = straight((0.0, 0.1, 1.0), radius=2.0), views(shape, shape)
+    pictures = paths(tree, taken)
+    for given, found in zip(pictures, engine.reconstruct(pictures, GRID).views, strict=True):
+        drawn = given.pixels * given.intensity.mm_per_count
+        assert found.path_mm.sum() == pytest.approx(drawn.sum(), rel=2e-3)
+        # Both lie on the same place.
+        for axis in (0, 1):
+            middles = [(p.sum(axis=1 - axis) @ np.arange(p.shape[axis])) / p.sum()
+                       for p in (found.path_mm, drawn)]  # fmt: skip
+            assert abs(middles[0] - middles[1]) < 0.05
 
 
 def test_marks_stay_on_what_they_mark():
@@ -133,6 +168,7 @@ def test_square_pixels_stay_as_they_are():
 
 
 def test_very_long_pixels_make_no_picture_without_bounds():
-    rows, columns = square_shape(carm(0, rows=1000, columns=100, pixel_spacing_mm=(0.1, 10.0)))
+    view = carm(0, rows=1000, columns=100, pixel_spacing_mm=(0.1, 10.0))
+    rows, columns = squared(angiogram(view, np.zeros((1000, 100)), "1")).pixels.shape
     assert rows * columns <= 2.1 * 1000 * 100
     assert rows / columns == pytest.approx(1000 * 0.1 / (100 * 10.0), rel=0.02)
