@@ -33,6 +33,7 @@ from gcar_deploy.tubes.gauss_newton import (
 )
 from gcar_deploy.tubes.hessian import seen_by
 from gcar_deploy.tubes.model import tubes_of
+from gcar_deploy.tubes.needed import needed_tree
 from gcar_deploy.tubes.prior import TAPER_PIXEL_MM
 from gcar_deploy.tubes.radius_refit import refit_radii
 from gcar_deploy.tubes.run import Run, State, coarsest_pixel_mm, started_at, tree_of
@@ -132,6 +133,9 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: Run) -> TubeFit:
         return dataclasses.replace(start, tree=now.tree, contrast=contrast)
     if not (options.levels_mm[-1] or progress.stopped or progress.failed):
         now = settled_topology(now, views, targets, run)
+        needed = needed_tree(now.tree, [target.carm for target in targets])
+        if needed is not now.tree:
+            now = run.fit(needed, targets, options.steps[-1])
         # Fitted ends point better than the points' did.
         whole = joined_in_pictures(now.tree, views, fitted=True)
         if whole is not now.tree:
