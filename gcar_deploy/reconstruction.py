@@ -192,7 +192,7 @@ class Reconstruction:
         )  # fmt: skip
         if not options.lesions:
             return given
-        return dataclasses.replace(given, notes=(*given.notes, *given.measured.unplaced))
+        return dataclasses.replace(given, notes=(*given.notes, *given.measured.on_marks))
 
     def summary(self) -> dict[str, Any]:
         """Content of ``result.json`` without the list of files; plain, finite values only."""

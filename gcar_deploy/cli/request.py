@@ -76,7 +76,7 @@ OPTIONS: Mapping[str, _Option] = {
     ),
     "lesions": click.option(
         "--lesion", "lesions", multiple=True, metavar="N:C1,R1:C2,R2",
-        help="Proximal and distal border of a lesion in view N; wins over those found; repeatable.",
+        help="Proximal and distal border of a lesion in view N, beside those found; repeatable.",
     ),
     "strict": click.option(
         "--strict", is_flag=True, help="Take a degraded result for a refusal (exit code 6)."

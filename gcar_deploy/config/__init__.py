@@ -98,5 +98,5 @@ class RunOptions:
     ostia: tuple[Landmark, ...] = ()
     #: a place on each branch that is to go, mm LPS, in the order of deletion
     deleted_mm: tuple[tuple[float, float, float], ...] = ()
-    #: borders of lesions marked in a picture; they win over those that are found
+    #: borders of lesions marked in a picture, beside those that are found
     lesions: tuple[LesionBorders, ...] = ()

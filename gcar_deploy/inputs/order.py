@@ -74,7 +74,7 @@ class Order:
     same_branch : a place on one vessel in each view, not the same place of it, or None
     ostia : where arteries begin, points as of ``landmarks``
     deleted_mm : a place on each branch that is to go, mm LPS, in the order of deletion
-    lesions : borders of lesions, which win over those that are found
+    lesions : borders of lesions, beside those that are found
     frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
     pixel_spacing_mm, sod_mm : for DICOM that does not say it, at the detector
     allow_rescale : take a picture of another size than its geometry's for a rescaled one

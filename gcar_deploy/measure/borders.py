@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -10,17 +11,16 @@ from gcar_deploy.config import LesionBorders
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.measure.sections import Sections
 from gcar_deploy.tree.tree import Tree, along
-from gcar_deploy.types import Scalars
 
 #: a branch further from a mark than this is not meant, mm at the isocentre
 FARTHEST_MM = 3.0
-#: a border's own diameter is the mean over so much of vessel outside of it, mm
-OUTSIDE_MM = 3.0
+#: sections where a lesion is narrowest, begins and ends
+Spot: TypeAlias = tuple[int, int, int]
 
 
 def marked_lesions(
     tree: Tree, sections: Sequence[Sections], carms: Sequence[CArm], marks: Sequence[LesionBorders]
-) -> tuple[Mapping[int, tuple[float, float]], tuple[str, ...]]:
+) -> tuple[Mapping[int, Sequence[tuple[float, float]]], tuple[str, ...]]:
     """Find the stretch that each pair of marks bounds.
 
     Parameters
@@ -32,10 +32,10 @@ def marked_lesions(
 
     Returns
     -------
-    branch -> (first, last) distance from its inlet, mm; and a sentence for each mark that no
-    branch passes at both ends
+    branch -> (first, last) distance from its inlet, mm, of each stretch that was marked in it;
+    and a sentence for each mark that no branch passes at both ends
     """
-    found: dict[int, tuple[float, float]] = {}
+    found: dict[int, list[tuple[float, float]]] = {}
     missed = []
     for number, mark in enumerate(marks, start=1):
         best: tuple[float, int, tuple[float, float]] | None = None
@@ -55,22 +55,23 @@ def marked_lesions(
                 f"lesion {number}: no branch passes within {FARTHEST_MM:g} mm of both its borders "
                 f"in view {mark.view}"
             )
-        else:
-            found[best[1]] = best[2]
+        elif best[2] not in found.setdefault(best[1], []):
+            found[best[1]].append(best[2])
     return found, tuple(missed)
 
 
-def between_borders(own: Sections, line: Scalars, stretch: tuple[float, float]) -> Scalars:
-    """(m,) reference with a straight line from one border's diameter to the other's.
+def beside_marked(found: Sequence[Spot], marked: Sequence[Spot]) -> tuple[list[Spot], list[Spot]]:
+    """Return those found that stay, and those that give way.
 
-    A border's diameter is the mean of the sections just outside of it; where none was measured
-    there, it is the reference as it was.
+    One gives way that is narrowest within a marked one. The others end at the marked borders, so
+    that a mark beside a graver lesion does not hide it.
     """
-    arc, first, last = own.arc_mm, *stretch
-    ends = []
-    for low, high, at in ((first - OUTSIDE_MM, first, first), (last, last + OUTSIDE_MM, last)):
-        near = own.measured & (arc >= low) & (arc <= high)
-        whole = float(np.interp(at, arc, line))
-        ends.append(float(own.diameter_mm[near].mean()) if near.any() else whole)
-    inside = (arc >= first) & (arc <= last)
-    return np.where(inside, np.interp(arc, stretch, ends), line)
+    kept, gone = [], []
+    for k, first, last in found:
+        if any(begin <= k <= end for _, begin, end in marked):
+            gone.append((k, first, last))
+            continue
+        first = max([first, *(end for _, _, end in marked if end < k)])
+        last = min([last, *(begin for _, begin, _ in marked if begin > k)])
+        kept.append((k, first, last))
+    return kept, gone

@@ -28,13 +28,17 @@ GOES_ON_MM, _ENOUGH = 10.0, 3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Lesion:
-    """One narrowing in figures; see ``BranchLumen``, whose figures are those of the gravest."""
+    """One narrowing in figures; see ``BranchLumen``, whose figures are those of the gravest.
+
+    ``marked``: its borders are the user's.
+    """
 
     minimal_diameter_mm: float
     minimal_at_mm: float
     reference_diameter_mm: float
     stenosis_percent: float
     lesion_mm: tuple[float, float]
+    marked: bool = False
 
 
 def going_on_mm(tree: Tree, sections: Sequence[Sections], clear: Sequence[Array]) -> list[float]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.measure.borders import between_borders
+from gcar_deploy.measure.borders import Spot, beside_marked
 from gcar_deploy.measure.lesions import (
     BORDER_SHARE,
     LESION_SHARE,
@@ -55,6 +55,7 @@ class BranchLumen:
     proximal_reference_mm, distal_reference_mm : reference diameter at the borders
     plaque_free_mm : length of vessel that is no narrower than its reference by a tenth
     lesions : all of the branch, the gravest first: the one that the figures above tell of
+    replaced : found ones that gave way to those the user marked
     narrows_to_mm : least diameter where the branch tapers or steps down by more than a lesion and
         is not wider again beyond; no lesion, and None where it does not
     """
@@ -75,6 +76,7 @@ class BranchLumen:
     distal_reference_mm: float | None = None
     plaque_free_mm: float | None = None
     lesions: tuple[Lesion, ...] | None = None
+    replaced: tuple[Lesion, ...] = ()
     narrows_to_mm: float | None = None
 
 
@@ -91,7 +93,7 @@ class BifurcationAngle:
 def tree_lumens(
     tree: Tree,
     sections: Sequence[Sections] | None = None,
-    marked: Mapping[int, tuple[float, float]] | None = None,
+    marked: Mapping[int, Sequence[tuple[float, float]]] | None = None,
 ) -> tuple[BranchLumen, ...]:
     """Measure every branch; see ``BranchLumen``.
 
@@ -99,7 +101,7 @@ def tree_lumens(
     ----------
     tree : Tree, branches from their inlets
     sections : of each branch; None takes the tree's own radii
-    marked : branch -> borders of its lesion as the user set them, distance from its inlet, mm
+    marked : branch -> borders of each lesion that the user set in it, distance from its inlet, mm
     """
     if sections is None:
         sections = sections_of_radii(tree)
@@ -108,7 +110,7 @@ def tree_lumens(
     marked = marked or {}
     further = going_on_mm(tree, sections, clear)
     return tuple(
-        _lumen(branch.arc_mm, own, (line, use, beyond), marked.get(k))
+        _lumen(branch.arc_mm, own, (line, use, beyond), marked.get(k, ()))
         for k, (branch, own, line, use, beyond) in enumerate(
             zip(tree.branches, sections, lines, clear, further, strict=True)
         )
@@ -130,14 +132,12 @@ def _lumen(
     arc_mm: Scalars,
     own: Sections,
     told: tuple[Scalars, Array, float],
-    marked: tuple[float, float] | None,
+    borders: Sequence[tuple[float, float]],
 ) -> BranchLumen:
-    line, clear, beyond = told
-    searched = clear
-    if marked is not None:
-        line = between_borders(own, line, marked)
-        searched = (own.arc_mm >= marked[0]) & (own.arc_mm <= marked[1])
-        clear = clear | searched
+    line, alone, beyond = told
+    clear = alone.copy()
+    for low, high in borders:
+        clear |= (own.arc_mm >= low) & (own.arc_mm <= high)
     healthy = np.full(len(arc_mm), np.nan)
     if np.count_nonzero(clear) < MIN_SECTIONS:
         return BranchLumen(healthy_mm=healthy, sections=own, clear=clear, reference_mm=line)
@@ -145,14 +145,11 @@ def _lumen(
     inner = (arc_mm >= low) & (arc_mm <= high)
     healthy[inner] = np.interp(arc_mm[inner], own.arc_mm, line)
     share = own.diameter_mm / line
-    again = recovers(own, line, clear, beyond)
-    if marked is None:
-        spots = narrowest(share, searched & again)
-        k, first, last = spots[0] if spots else (slightest(share, searched, again),) * 3
-    else:
-        first, last = np.flatnonzero(searched)[[0, -1]].tolist()
-        k = int(np.argmin(np.where(searched, share, np.inf)))
-        spots = [(k, first, last)]
+    again = recovers(own, line, alone, beyond)
+    marked = [_between(own, share, *ends) for ends in borders]
+    found, gone = beside_marked(narrowest(share, alone & again), marked)
+    spots = sorted([*marked, *found], key=lambda spot: float(share[spot[0]]))
+    k, first, last = spots[0] if spots else (slightest(share, alone, again),) * 3
     for_good = clear & ~again & (share < 1 - LESION_SHARE)
     for _, begin, end in spots:
         for_good[begin : end + 1] = False
@@ -174,9 +171,19 @@ def _lumen(
         proximal_reference_mm=float(line[first]) if last > first else None,
         distal_reference_mm=float(line[last]) if last > first else None,
         plaque_free_mm=float(spans[clear & (share >= BORDER_SHARE)].sum()),
-        lesions=tuple(lesion_at(own, line, *spot) for spot in spots),
+        lesions=tuple(
+            dataclasses.replace(lesion_at(own, line, *spot), marked=spot in marked)
+            for spot in spots
+        ),
+        replaced=tuple(lesion_at(own, line, *spot) for spot in gone),
         narrows_to_mm=float(own.diameter_mm[for_good].min()) if for_good.any() else None,
     )
+
+
+def _between(own: Sections, share: Scalars, low: float, high: float) -> Spot:
+    """Sections where the vessel is narrowest between two borders, and those of the borders."""
+    inside = np.flatnonzero((own.arc_mm >= low) & (own.arc_mm <= high))
+    return int(inside[np.argmin(share[inside])]), int(inside[0]), int(inside[-1])
 
 
 def bifurcation_angles(tree: Tree) -> tuple[BifurcationAngle, ...]:

@@ -35,7 +35,7 @@ class Measured:
     names : per branch its name (LM, LAD, LCx, RCA) with its probability, or None
     lumens : per branch its diameters, measured from its inlet
     bifurcations : where one branch becomes two, each with its three segments
-    unplaced : a sentence for each lesion the user marked where no branch runs
+    on_marks : what became of each lesion the user marked, as sentences
     angles : between each two branches that meet
     hidden : (branches, views) share of a branch's length that a view hides, 0 .. 1
     residual_mm : (views, n) distance of each point of ``tree.points()`` from the view's vessels
@@ -46,7 +46,7 @@ class Measured:
     names: tuple[BranchName | None, ...]
     lumens: tuple[BranchLumen, ...]
     bifurcations: tuple[Bifurcation, ...]
-    unplaced: tuple[str, ...]
+    on_marks: tuple[str, ...]
     angles: tuple[BifurcationAngle, ...]
     hidden: Array
     residual_mm: Array
@@ -70,18 +70,31 @@ def measured(
     """
     points, carms = tree.points(), [view.carm for view in views]
     sections = sections_of_radii(tree) if sections is None else sections
-    marked, unplaced = marked_lesions(tree, sections, carms, marks)
+    marked, missed = marked_lesions(tree, sections, carms, marks)
     lumens = tree_lumens(tree, sections, marked)
     return Measured(
         names=read_anatomy(tree).names,
         lumens=lumens,
         bifurcations=bifurcations(tree, lumens),
-        unplaced=unplaced,
+        on_marks=(*_marked_notes(lumens), *missed),
         angles=bifurcation_angles(tree),
         hidden=np.stack([foreshortening(tree, carm) for carm in carms], axis=1),
         residual_mm=np.stack([residuals(points, view) for view in views]),
         further=best_further_view(tree, carms),
     )
+
+
+def _marked_notes(lumens: Sequence[BranchLumen]) -> list[str]:
+    """Say which lesions have the user's borders, and which found ones gave way to them."""
+    out = []
+    for k, lumen in enumerate(lumens, start=1):
+        for own in (one for one in lumen.lesions or () if one.marked):
+            first, last = own.lesion_mm
+            gone = [f"{one.stenosis_percent:.0f} % at {one.minimal_at_mm:.1f} mm"
+                    for one in lumen.replaced if first <= one.minimal_at_mm <= last]  # fmt: skip
+            said = f"of the user: borders of a lesion of branch {k}, {first:.1f} - {last:.1f} mm"
+            out.append(said + (f"; found there: {', '.join(gone)}" if gone else ""))
+    return out
 
 
 def residuals(points_mm: Points, view: VesselImage) -> Scalars:

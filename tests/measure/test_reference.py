@@ -9,7 +9,7 @@ from gcar_deploy.measure.borders import marked_lesions
 from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.measure.reference import FLOW_EXPONENT
 from gcar_deploy.measure.sections import sections_of_radii
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.tree import Tree, along
 from tests.tree.shapes import branch
 from tests.tubes.scenes import two_views
 
@@ -75,23 +75,51 @@ def test_three_segments_meet_at_a_bifurcation():
     assert node.calibre_ratio == pytest.approx(3.6 / (3.0 + side), rel=0.02)
 
 
-def test_the_users_borders_win():
+def marks_at(tree, k, *stretches):
+    """Borders in view 2 of so many stretches of a branch, mm from its inlet."""
+    line, (_, carm) = tree.branches[k], two_views()
+    pixels = [carm.project(along(line.points_mm, line.arc_mm, np.array(s)))[0] for s in stretches]
+    return [LesionBorders(view=2, proximal=tuple(a), distal=tuple(b)) for a, b in pixels]
+
+
+def with_marks(tree, k, *stretches):
+    """Lumen of a branch with so many lesions marked."""
+    sections = sections_of_radii(tree)
+    marked, missed = marked_lesions(tree, sections, two_views(), marks_at(tree, k, *stretches))
+    assert missed == () and list(marked) == [k]
+    return tree_lumens(tree, sections, marked)[k]
+
+
+def test_a_marked_lesion_has_the_users_borders_and_the_same_reference():
     tree = bifurcated(narrow=(1, 20.0, 8.0, 0.5))
-    carms, sections = two_views(), sections_of_radii(tree)
-    line = tree.branches[1]
-    ends = [line.points_mm[np.argmin(np.abs(line.arc_mm - at))] for at in (18.0, 22.0)]
-    proximal, distal = (tuple(carms[1].project(e[None])[0][0].tolist()) for e in ends)
-    mark = LesionBorders(view=2, proximal=proximal, distal=distal)
-    marked, missed = marked_lesions(tree, sections, carms, (mark,))
-    assert missed == () and list(marked) == [1]
-    assert marked[1] == pytest.approx((18, 22), abs=0.6)
-    found = tree_lumens(tree, sections, marked)[1]
+    found, free = with_marks(tree, 1, (18.0, 22.0)), tree_lumens(tree)[1]
+    (lesion,) = found.lesions
+    assert lesion.marked and not free.lesions[0].marked
     assert found.lesion_mm == pytest.approx((18, 22), abs=0.6)
-    # Set within the lesion, borders have a reference that is narrowed itself.
-    assert found.reference_diameter_mm < 2.9
-    assert found.stenosis_percent < 47
-    free = tree_lumens(tree, sections)[1]
-    assert free.reference_diameter_mm == pytest.approx(3.0, abs=0.05)
+    # Borders within the lesion do not make a narrowed vessel the healthy one.
+    assert found.reference_diameter_mm == free.reference_diameter_mm
+    assert found.stenosis_percent == free.stenosis_percent
+    assert found.replaced == free.lesions
+
+
+def test_a_marked_lesion_stands_beside_those_found():
+    tree = bifurcated(narrow=(1, 20.0, 8.0, 0.5))
+    (free,) = tree_lumens(tree)[1].lesions
+    marked = with_marks(tree, 1, (4.0, 8.0), (28.0, 31.0))
+    assert [one.marked for one in marked.lesions] == [False, True, True]
+    assert marked.lesions[0] == free and marked.replaced == ()
+    assert marked.stenosis_percent == free.stenosis_percent
+    ends = sorted(one.lesion_mm for one in marked.lesions[1:])
+    assert ends[0] == pytest.approx((4, 8), abs=0.6)
+    assert ends[1] == pytest.approx((28, 31), abs=0.6)
+
+
+def test_a_mark_beside_the_narrowest_place_cuts_a_found_lesion():
+    tree = bifurcated(narrow=(1, 20.0, 12.0, 0.6))
+    grave, own = with_marks(tree, 1, (22.0, 27.0)).lesions
+    assert own.marked and not grave.marked
+    assert grave.stenosis_percent == pytest.approx(60, abs=2)
+    assert grave.lesion_mm[1] == own.lesion_mm[0] == pytest.approx(22, abs=0.6)
 
 
 def test_a_mark_beside_every_vessel_is_said():
