@@ -1,14 +1,14 @@
 """Measurements of a result as a Comprehensive 3D SR (PS3.3 A.35.13, PS3.16 TID 1500), by highdicom.
 
-One group of measurements a branch. A diameter says where along the vessel it was measured, as a
-code of the vascular measurement sites (PS3.16 CID 3486) and as a point in patient coordinates
-(mm LPS, the frame of reference of the surface). What the standard has no code for is of scheme
-``99GCAR``. Neither verified nor final: whoever files it may do that.
+One group of measurements a branch, then one for each further lesion. A diameter says where along
+the vessel it was measured, as a code of the vascular measurement sites (PS3.16 CID 3486) and as a
+point in patient coordinates (mm LPS, the frame of reference of the surface). What the standard has
+no code for is of scheme ``99GCAR``. Neither verified nor final: whoever files it may do that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -65,7 +65,8 @@ def measurement_report(
         procedure_reported=codes.SCT.CoronaryArteriography,
         title=codes.DCM.ImagingMeasurementReport,
         imaging_measurements=[
-            _group(stored, k, frame, runs) for k in range(len(stored.tree.branches))
+            *(_group(stored, k, frame, runs) for k in range(len(stored.tree.branches))),
+            *_further_lesions(stored, frame, runs),
         ],
     )  # fmt: skip
     said = stored.summary
@@ -86,9 +87,7 @@ def measurement_report(
 
 def _group(stored: Stored, k: int, frame: str, runs: Sequence[Any]) -> Any:
     """Measurements of one branch."""
-    import highdicom as hd
     from pydicom.sr.codedict import codes
-    from pydicom.uid import generate_uid
 
     branch, row = stored.tree.branches[k], stored.summary["tree"]["branches"][k]
     lesion = row.get("lesion_mm") or (None, None)
@@ -108,16 +107,53 @@ def _group(stored: Stored, k: int, frame: str, runs: Sequence[Any]) -> Any:
         _number(sct.LumenAreaStenosis, row.get("area_stenosis_percent"), "%"),
         _number(sct.StenoticLesionLength, row["lesion_length_mm"] or None, "mm"),
         _number(sct.LengthOfVesselSegment, row["length_mm"], "mm"),
-        _number(_own("REFERENCE", "Healthy diameter at the narrowing"),
-                row["reference_diameter_mm"], "mm"),
+        _number(_reference(), row["reference_diameter_mm"], "mm"),
         _number(_own("GHOST", "Probability that the branch is not there"),
                 _percent(row.get("ghost_probability")), "%"),
+        _number(_own("NAME", "Probability of the name of the vessel"),
+                _percent(row.get("name_confidence")), "%"),
     ]  # fmt: skip
     narrowed = (row["stenosis_percent"] or 0.0) > 0 and row["lesion_length_mm"]
-    name = f"branch {k + 1}" + (f", {row['name']}" if row["name"] else "")
+    finding = sct.Stenosis if narrowed else sct.LumenOfBloodVessel
+    return _measurements(_title(row, k), finding, vessel, found, runs)
+
+
+def _further_lesions(stored: Stored, frame: str, runs: Sequence[Any]) -> list[Any]:
+    """One group for each lesion beside the gravest, of which the branch's own group tells."""
+    from pydicom.sr.codedict import codes
+
+    sct, out = codes.SCT, []
+    for k, row in enumerate(stored.summary["tree"]["branches"]):
+        vessel = getattr(sct, _VESSELS[row["name"]])
+        for number, one in enumerate((row.get("lesions") or ())[1:], start=2):
+            first, last = one["lesion_mm"]
+            point = _point(stored.tree.branches[k], one["minimal_at_mm"], frame)
+            found = [
+                _at(sct.VesselLumenDiameter, one["minimal_diameter_mm"], vessel,
+                    codes.DCM.SiteOfLumenMinimum, point),
+                _number(sct.LumenDiameterStenosis, one["stenosis_percent"], "%"),
+                _number(sct.StenoticLesionLength, last - first, "mm"),
+                _number(_reference(), one["reference_diameter_mm"], "mm"),
+            ]  # fmt: skip
+            name = f"{_title(row, k)}, lesion {number}"
+            out.append(_measurements(name, sct.Stenosis, vessel, found, runs))
+    return out
+
+
+def _title(row: Mapping[str, Any], k: int) -> str:
+    return f"branch {k + 1}" + (f", {row['name']}" if row["name"] else "")
+
+
+def _measurements(
+    name: str, finding: Any, vessel: Any, found: Sequence[Any], runs: Sequence[Any]
+) -> Any:
+    """Group of what was measured at one finding of a vessel; None stands for no value."""
+    import highdicom as hd
+    from pydicom.uid import generate_uid
+
     return hd.sr.MeasurementsAndQualitativeEvaluations(
         tracking_identifier=hd.sr.TrackingIdentifier(uid=generate_uid(), identifier=name),
-        finding_type=sct.Stenosis if narrowed else sct.LumenOfBloodVessel,
+        finding_type=finding,
         finding_sites=[hd.sr.FindingSite(anatomic_location=vessel)],
         algorithm_id=hd.sr.AlgorithmIdentification(name="gcar", version=version("gcar")),
         measurements=[one for one in found if one is not None],
@@ -167,6 +203,10 @@ def _own(value: str, meaning: str) -> Any:
     import highdicom as hd
 
     return hd.sr.CodedConcept(value=value, scheme_designator=_SCHEME, meaning=meaning)
+
+
+def _reference() -> Any:
+    return _own("REFERENCE", "Healthy diameter at the narrowing")
 
 
 def _percent(share: float | None) -> float | None:

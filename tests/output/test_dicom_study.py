@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import itertools
 import json
 import shutil
 import subprocess
@@ -17,9 +19,11 @@ pytest.importorskip("highdicom", reason="needs the sr extra")
 import highdicom as hd
 import pydicom
 from pydicom.sr.codedict import codes
+from pydicom.uid import generate_uid
 
 from gcar_deploy.errors import GcarError, UsageError
-from gcar_deploy.output.dicom_study import file_bytes, study_objects
+from gcar_deploy.output.dicom_sr import measurement_report
+from gcar_deploy.output.dicom_study import _EMPTY, file_bytes, study_objects
 from gcar_deploy.output.stored import read_folder
 from tests.cli.conftest import gcar
 from tests.dicom.made_result import named, of_jane, result_of
@@ -114,6 +118,55 @@ def test_the_report_says_what_the_result_says_and_where(archive, result, jane):
     surface = pydicom.dcmread(archive / "surface.dcm")
     first = next(iter(groups[0].get_measurements(codes.SCT.VesselLumenDiameter)))
     assert first.referenced_coordinates[0].frame_of_reference_uid == surface.FrameOfReferenceUID
+
+
+def report_of(result, jane, change):
+    """The report of a result whose summary was changed, read back."""
+    stored = read_folder(result)
+    summary = json.loads(json.dumps(stored.summary))
+    change(summary)
+    runs = [pydicom.dcmread(run, stop_before_pixels=True) for run in jane]
+    for run, keyword in itertools.product(runs, _EMPTY):
+        run.setdefault(keyword, "")
+    made = measurement_report(
+        dataclasses.replace(stored, summary=summary), runs, generate_uid(), (generate_uid(), 3)
+    )
+    return hd.sr.Comprehensive3DSR.from_dataset(made)
+
+
+def test_every_lesion_of_a_branch_stands_in_the_report(result, jane):
+    def lesion(at, percent, length):
+        return {
+            "minimal_diameter_mm": 2.5 * (1 - percent / 100), "minimal_at_mm": at,
+            "reference_diameter_mm": 2.5, "stenosis_percent": percent,
+            "lesion_mm": [at - length / 2, at + length / 2],
+        }  # fmt: skip
+
+    def change(summary):
+        row = summary["tree"]["branches"][0]
+        row.update(name="LAD", name_confidence=0.93)
+        row["lesions"] = [lesion(4.0, 60.0, 3.0), lesion(12.0, 40.0, 5.0), lesion(8.0, 30.0, 2.0)]
+
+    report = report_of(result, jane, change)
+    groups = report.content.get_image_measurement_groups()
+    count = len(read_folder(result).tree.branches)
+    assert [g.tracking_identifier for g in groups[count:]] == [
+        "branch 1, LAD, lesion 2", "branch 1, LAD, lesion 3",
+    ]  # fmt: skip
+    line = read_folder(result).tree.branches[0]
+    for group, at, percent, length in zip(
+        groups[count:], (12, 8), (40, 30), (5, 2), strict=True
+    ):  # fmt: skip
+        assert group.finding_type == codes.SCT.Stenosis
+        (told,) = group.get_measurements(codes.SCT.LumenDiameterStenosis)
+        (long,) = group.get_measurements(codes.SCT.StenoticLesionLength)
+        (least,) = group.get_measurements(codes.SCT.VesselLumenDiameter)
+        assert (told.value, long.value) == (percent, length)
+        assert least.value == pytest.approx(2.5 * (1 - percent / 100))
+        near = np.linalg.norm(line.points_mm - least.referenced_coordinates[0].value, axis=1)
+        assert abs(line.arc_mm[near.argmin()] - at) < 0.6
+    (named_as,) = (m for m in groups[0].get_measurements() if m.name.value == "NAME")
+    assert named_as.value == 93
 
 
 @pytest.mark.skipif(VALIDATOR is None, reason="needs dciodvfy of dicom3tools")
