@@ -70,7 +70,9 @@ def measurement_report(
         ],
     )  # fmt: skip
     said = stored.summary
-    sentences = [f"{said['status']}: {said['sentence']}", *said["silent_errors"], said["use"]]
+    # The first finding is the sentence. Notes say what goes back to strokes and marks of the user.
+    told = [*said["findings"][1:], *said["notes"], *said["silent_errors"]]
+    sentences = [f"{said['status']}: {said['sentence']}", *told, said["use"]]
     for text in sentences:
         content[0].ContentSequence.append(_comment(text))
     report = hd.sr.Comprehensive3DSR(

@@ -104,11 +104,7 @@ def test_the_report_says_what_the_result_says_and_where(archive, result, jane):
             near = np.linalg.norm(branch.points_mm - least.referenced_coordinates[0].value, axis=1)
             assert abs(branch.arc_mm[near.argmin()] - row["minimal_at_mm"]) < 0.6
     assert points
-    said = [
-        item.TextValue
-        for item in report.ContentSequence
-        if (item.ValueType, item.RelationshipType) == ("TEXT", "CONTAINS")
-    ]
+    said = comments(report)
     assert said[0] == "{status}: {sentence}".format(**stored.summary)
     assert "Research use only" in said[-1]
     assert report.VerificationFlag == "UNVERIFIED"
@@ -118,6 +114,14 @@ def test_the_report_says_what_the_result_says_and_where(archive, result, jane):
     surface = pydicom.dcmread(archive / "surface.dcm")
     first = next(iter(groups[0].get_measurements(codes.SCT.VesselLumenDiameter)))
     assert first.referenced_coordinates[0].frame_of_reference_uid == surface.FrameOfReferenceUID
+
+
+def comments(report):
+    return [
+        item.TextValue
+        for item in report.ContentSequence
+        if (item.ValueType, item.RelationshipType) == ("TEXT", "CONTAINS")
+    ]
 
 
 def report_of(result, jane, change):
@@ -167,6 +171,15 @@ def test_every_lesion_of_a_branch_stands_in_the_report(result, jane):
         assert abs(line.arc_mm[near.argmin()] - at) < 0.6
     (named_as,) = (m for m in groups[0].get_measurements() if m.name.value == "NAME")
     assert named_as.value == 93
+
+
+def test_the_report_says_what_is_the_users(result, jane):
+    notes = ["view 1: 2 strokes of the user erase vessel", "of the user: branches deleted (1)"]
+
+    def change(summary):
+        summary.update(findings=["first", "second"], notes=notes)
+
+    assert comments(report_of(result, jane, change))[1:4] == ["second", *notes]
 
 
 @pytest.mark.skipif(VALIDATOR is None, reason="needs dciodvfy of dicom3tools")
