@@ -167,7 +167,7 @@ def _registered(
     with placed.hinting():
         hull = seen_by_all(placed.views, grid, marked, predictor()).hull
         check_candidates(len(hull), hull.lattice, marked.quality)
-    check_gross_scale(angiograms, views)
+        check_gross_scale(angiograms, views)
     return list(placed.findings)
 
 

@@ -139,12 +139,13 @@ def _reconstructed(
         seen = seen_by_all(placed.views, grid, options, predictor)
         keep(seen)
         check_candidates(len(seen.hull), seen.hull.lattice, options.quality)
-    check_gross_scale(angiograms, vessels.views)
+    with placed.hinting():
+        check_gross_scale(angiograms, vessels.views)
     with watch.stage("centers"):
         centers = find_centers(seen, predictor, options, watch)
         keep(centers)
     told = None if centers.evidence is None else centers.evidence.points
-    with watch.stage("refine") as report:
+    with watch.stage("refine") as report, placed.hinting():
         refined = refine(
             centers.points, placed.views, options.refine, report, watch.budget(), told
         ).or_fail()

@@ -35,6 +35,7 @@ class Registered:
     findings : reasons for ``degraded``
     hint : what a refusal should say as well; mostly empty
     refusal : why the views cannot show one tree; empty where they can
+    drawn : strokes and marks of the user, which a refusal should name; empty without any
     """
 
     views: tuple[VesselImage, ...]
@@ -42,6 +43,7 @@ class Registered:
     findings: tuple[str, ...]
     hint: str
     refusal: str
+    drawn: str = ""
 
     @property
     def disagreement(self) -> float:
@@ -73,11 +75,12 @@ class Registered:
     def or_refuse(self) -> None:
         """Raise RefusedError where the views contradict each other."""
         if self.refusal:
-            raise RefusedError(self.refusal)
+            with with_hint("", self.drawn):
+                raise RefusedError(self.refusal)
 
     def hinting(self) -> contextlib.AbstractContextManager[None]:
-        """Let a refusal of a later stage say the hint as well."""
-        return with_hint(self.hint)
+        """Let a refusal of a later stage name what was drawn, and say the hint as well."""
+        return with_hint(self.hint, self.drawn)
 
 
 def register(
@@ -138,7 +141,20 @@ def register(
         findings=tuple(findings),
         hint=hint,
         refusal=refusal or (_two_contradictions(poses) if by_width else ""),
+        drawn=_drawn(angiograms, options),
     )
+
+
+def _drawn(angiograms: Sequence[Angiogram], options: RunOptions) -> str:
+    """Name what the user drew: where views contradict each other, it is doubted before them."""
+    what = [f"strokes in view {one.view_id}" for one in angiograms
+            if one.erased is not None or one.painted is not None]  # fmt: skip
+    marks = {
+        "landmarks": options.landmarks, "marks of one vessel": options.same_branch,
+        "inlets": options.ostia,
+    }  # fmt: skip
+    what += [f"{name} ({len(given)})" for name, given in marks.items() if given]
+    return f"the user's {', '.join(what)}" if what else ""
 
 
 def _placed(view: VesselImage, pose: Pose) -> VesselImage:

@@ -344,12 +344,16 @@ def check_tree(tree: Tree, options: QualityOptions, confidence: Scalars | None =
 
 
 @contextlib.contextmanager
-def with_hint(hint: str) -> Iterator[None]:
-    """Let a refusal say as well what may be the reason; an empty hint adds nothing."""
+def with_hint(hint: str, marks: str = "") -> Iterator[None]:
+    """Let a refusal say what may be the reason: first marks of the user, at the end a hint.
+
+    Where both are empty it stays as it is.
+    """
     try:
         yield
     except RefusedError as error:
-        if not hint:
+        if not (hint or marks):
             raise
-        end = "" if str(error).endswith("?") else "."
-        raise RefusedError(f"{error}{end} {hint[0].upper()}{hint[1:]}") from None
+        said = f"{marks} may be the reason: {error}" if marks else str(error)
+        end = "" if said.endswith("?") else "."
+        raise RefusedError(f"{said}{end} {hint[0].upper()}{hint[1:]}" if hint else said) from None

@@ -1,6 +1,7 @@
 """Registration: what views that show one tree, or do not, are told before there is any tree."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -34,6 +35,23 @@ def test_a_move_between_the_runs_is_built_into_the_views_and_said():
     assert "had to be moved" in said and placed.refusal == ""
     assert placed.views[1].carm == placed.poses[1].applied(told.carm) != told.carm
     assert placed.views[0] is views[0]
+
+
+def test_a_refusal_names_what_the_user_drew_before_it_doubts_the_pictures():
+    angiograms, views = pair(calibrated=True)
+    erased = dataclasses.replace(angiograms[1], erased=np.zeros(views[1].mask.shape, bool))
+    options = dataclasses.replace(OPTIONS, ostia=(((90.0, 90.0), (90.0, 90.0)),))
+    placed = register([angiograms[0], erased], views, options, never)
+    placed = dataclasses.replace(placed, refusal="they contradict each other; patients?")
+    said = "the user's strokes in view 2, inlets (1) may be the reason: they contradict"
+    with pytest.raises(RefusedError, match=re.escape(said)):
+        placed.or_refuse()
+    with pytest.raises(RefusedError, match="reason: too short"), placed.hinting():
+        raise RefusedError("too short")
+    plain = dataclasses.replace(placed, drawn="")
+    with pytest.raises(RefusedError, match="they contradict"):
+        plain.or_refuse()
+    assert register(angiograms, views, OPTIONS, never).drawn == ""
 
 
 @pytest.mark.slow
