@@ -49,7 +49,7 @@ def run(
     check_view_numbers(order)
     if print_order:
         # Wherever the text is put, it names the same files.
-        click.echo(order_to_json(order.relative_to(Path.cwd())), nl=False)
+        click.echo(order_to_json(order.relative_to(Path.cwd()).with_drawn_on()), nl=False)
         return
     engine.limit_threads()
     from gcar_deploy.engine import check_target_of, deliver

@@ -47,10 +47,14 @@ class Stroke:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Drawn:
-    """All that was drawn in one view; strokes count in their order, the last one wins."""
+    """All that was drawn in one view; strokes count in their order, the last one wins.
+
+    ``on``: SHA-256 of the file that it, and every mark, was drawn on; empty where nobody told.
+    """
 
     strokes: tuple[Stroke, ...] = ()
     region: tuple[Place, ...] = ()
+    on: str = ""
 
     def inside(self, shape: tuple[int, ...]) -> Mask | None:
         """(rows, cols) bool, where the view is to be looked at; None for everywhere."""
@@ -115,12 +119,14 @@ def by_view(key: str, value: Any, of: str) -> dict[int, Any]:
 
 
 def drawn_by_view(
-    edits: Mapping[int, tuple[Stroke, ...]], regions: Mapping[int, tuple[Place, ...]]
+    edits: Mapping[int, tuple[Stroke, ...]],
+    regions: Mapping[int, tuple[Place, ...]],
+    drawn_on: Mapping[int, str],
 ) -> dict[int, Drawn]:
-    """Return what was drawn in each view that was drawn in."""
+    """Return what was drawn in each view that was drawn in, or may have been."""
     return {
-        k: Drawn(strokes=edits.get(k, ()), region=regions.get(k, ()))
-        for k in sorted({*edits, *regions})
+        k: Drawn(strokes=edits.get(k, ()), region=regions.get(k, ()), on=drawn_on.get(k, ""))
+        for k in sorted({*edits, *regions, *drawn_on})
     }
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from gcar_deploy.config import (
 )
 from gcar_deploy.config.ranges import Range, check_field, check_number
 from gcar_deploy.errors import GeometryError, UsageError
-from gcar_deploy.files import read_text
+from gcar_deploy.files import digest_of, read_text
 from gcar_deploy.geometry.fields import (
     LEAST_VIEWS,
     MOST_VIEWS,
@@ -51,6 +52,9 @@ SCHEMA = "gcar-order/1"
 MAX_BYTES = 16 * 1024 * 1024
 #: a branch to be deleted is named by a place within so much of the isocentre, mm
 _FARTHEST_MM = 2000.0
+#: no picture or run that is read is larger
+_MOST_BYTES = 2**40
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 POSES = ("auto", "off")
 #: further file that an order may ask for -> its name in the result folder
 EXTRAS = {"glb": "surface.glb", "dicom-stl": "surface.dcm"}
@@ -75,6 +79,8 @@ class Order:
     ostia : where arteries begin, points as of ``landmarks``
     deleted_mm : a place on each branch that is to go, mm LPS, in the order of deletion
     lesions : borders of lesions, beside those that are found
+    drawn_on : number of the view, from 1 -> SHA-256 of the file that all of these were drawn on;
+        they are refused on another
     frames : of each DICOM run, from 1, None to choose; one entry holds for all runs
     pixel_spacing_mm, sod_mm : for DICOM that does not say it, at the detector
     allow_rescale : take a picture of another size than its geometry's for a rescaled one
@@ -97,6 +103,7 @@ class Order:
     ostia: tuple[Landmark, ...] | None = None
     deleted_mm: tuple[tuple[float, float, float], ...] | None = None
     lesions: tuple[LesionBorders, ...] | None = None
+    drawn_on: Mapping[int, str] = dataclasses.field(default_factory=dict)
     frames: tuple[int | None, ...] | None = None
     pixel_spacing_mm: float | None = None
     sod_mm: float | None = None
@@ -143,7 +150,25 @@ class Order:
     @property
     def drawn(self) -> dict[int, Drawn]:
         """Number of the view -> what was drawn in it."""
-        return drawn_by_view(self.edits, self.regions)
+        return drawn_by_view(self.edits, self.regions, self.drawn_on if self._is_drawn else {})
+
+    @property
+    def _is_drawn(self) -> bool:
+        return any(getattr(self, key) for key in _DRAWN)
+
+    def with_drawn_on(self) -> Order:
+        """Return the order with the SHA-256 of its views, where something was drawn on them.
+
+        One that is told already stays; a view that is no file has none.
+        """
+        if not self._is_drawn:
+            return dataclasses.replace(self, drawn_on={})
+        new = {
+            k: digest_of(path, _MOST_BYTES, 0).hex()
+            for k, path in enumerate(self.views, start=1)
+            if k not in self.drawn_on and path.is_file()
+        }
+        return dataclasses.replace(self, drawn_on={**self.drawn_on, **new})
 
     def with_files(self, change: Callable[[str, Path], Path]) -> Order:
         """Return the order with each of its files replaced by ``change(name, path)``."""
@@ -188,6 +213,8 @@ class Order:
         return out
 
 
+#: keys of what is drawn or marked in the pictures, or holds for the tree of them alone
+_DRAWN = ("edits", "regions", "landmarks", "same_branch", "ostia", "deleted_mm", "lesions")
 KEYS = ("schema", *(field.name for field in dataclasses.fields(Order)))
 
 
@@ -247,7 +274,8 @@ def check_view_numbers(order: Order) -> None:
     for lesion in order.lesions or ():
         if not 1 <= lesion.view <= count:
             raise UsageError(f"lesions.view = {lesion.view}: there are views 1 .. {count}")
-    for what, named in (("mask", order.masks), ("edits", order.edits), ("region", order.regions)):
+    for what, named in (("mask", order.masks), ("edits", order.edits), ("region", order.regions),
+                        ("drawn_on", order.drawn_on)):  # fmt: skip
         for k in named:
             if not 1 <= k <= count:
                 raise UsageError(f"{what} {k}: there are views 1 .. {count}")
@@ -266,7 +294,7 @@ def _order(values: Any) -> Order:
         "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,
         "edits": parse_edits, "regions": parse_regions, "ostia": _landmarks,
         "same_branch": _landmarks,
-        "deleted_mm": _deleted, "lesions": _lesions,
+        "deleted_mm": _deleted, "lesions": _lesions, "drawn_on": _digests,
         "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
         "force": _truth, "allow_rescale": _truth, "out": _path, "extras": _texts,
     }  # fmt: skip
@@ -305,6 +333,14 @@ def _geometry(key: str, value: Any) -> Any:
 
 def _masks(key: str, value: Any) -> dict[int, Path]:
     return {k: _path(f"{key}.{k}", name) for k, name in by_view(key, value, "file").items()}
+
+
+def _digests(key: str, value: Any) -> dict[int, str]:
+    found = by_view(key, value, "SHA-256")
+    for k, digest in found.items():
+        if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
+            raise UsageError(f"{key}.{k} = {quote(digest)} must be 64 digits 0 .. f")
+    return found
 
 
 def _landmarks(key: str, value: Any) -> tuple[Landmark, ...]:

@@ -60,7 +60,7 @@ def prepare(
     Raises
     ------
     UsageError
-        Fewer than two pictures, or a mask or strokes of no view.
+        Fewer than two pictures, a mask or strokes of no view, or strokes of another picture.
     GeometryError
         Not as many pictures as views, or sizes at odds (see ``match_picture``).
     ImageError
@@ -124,7 +124,19 @@ def _check_masks(masks: Mapping[int, Mask]) -> None:
 
 
 def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
-    """Give a picture what was drawn in it."""
+    """Give a picture what was drawn in it.
+
+    Raises
+    ------
+    UsageError
+        It was drawn on another picture.
+    """
+    if drawn.on not in ("", angiogram.sha256):
+        raise UsageError(
+            f"view {angiogram.view_id}: what is drawn or marked was so on another picture (SHA-256 "
+            f"{drawn.on[:12]}, not {angiogram.sha256[:12]}); take drawn_on out of the order to use "
+            "it all the same"
+        )
     shape = angiogram.pixels.shape
     marks, inside = drawn.marks(shape), drawn.inside(shape)
     if marks is not None:

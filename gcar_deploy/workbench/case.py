@@ -306,6 +306,8 @@ class Case:
 
     def _keep(self, order: Order) -> Order:
         """Write the order into the folder, unless another program did so since; return it."""
+        drawn_on = order.relative_to(self.folder).with_drawn_on().drawn_on
+        order = dataclasses.replace(order, drawn_on=drawn_on)
         text, file = order_to_json(order), self.order_file
         if len(text) > MAX_BYTES:
             raise UsageError(

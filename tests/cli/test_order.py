@@ -76,6 +76,7 @@ def test_lesions_of_the_command_line_are_those_of_an_order(good_case, tmp_path):
     (tmp_path / "o.json").write_text(
         gcar(*arguments(good_case, tmp_path / "a", *told, "--print-order")).out
     )
+    assert sorted(load_order(tmp_path / "o.json").drawn_on) == [1, 2]
     assert load_order(tmp_path / "o.json").lesions == (
         LesionBorders(view=1, proximal=(10.0, 20.5), distal=(30.0, 40.0)),
         LesionBorders(view=2, proximal=(1.0, 2.0), distal=(3.0, 4.0)),

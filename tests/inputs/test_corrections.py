@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import RefusedError
+from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.inputs.drawn import Drawn, Stroke
 from gcar_deploy.inputs.order import Order, parse_order
 
@@ -52,6 +52,33 @@ def order():
 @pytest.fixture(scope="module")
 def plain(engine, order):
     return engine.reconstruct_order(order)
+
+
+CORRECTED = {
+    "edits": {1: (Stroke(do="erase", points=SQUARE),)}, "deleted_mm": ((0.0, 0.0, 0.0),),
+    "landmarks": (((200.0, 200.0), (200.0, 200.0)),),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", sorted(CORRECTED))
+def test_corrections_are_refused_on_other_pictures_than_they_were_drawn_on(key, engine, order):
+    told = dataclasses.replace(order, **{key: CORRECTED[key]}).with_drawn_on()
+    assert [len(one) for one in told.drawn_on.values()] == [64, 64]
+    first, second = order.views
+    with pytest.raises(UsageError, match="view 1: what is drawn or marked was so on another"):
+        again(engine, told, views=(second, first))
+    # A view that is told stays as it is told, and without a correction nothing is.
+    assert dataclasses.replace(told, views=(second, first)).with_drawn_on() == dataclasses.replace(
+        told, views=(second, first)
+    )
+    assert order.with_drawn_on() == order
+    freed = dataclasses.replace(told, **{key: {} if key == "edits" else None})
+    assert freed.with_drawn_on() == order and not freed.drawn
+
+
+def test_corrections_of_the_same_pictures_are_taken(engine, order):
+    told = dataclasses.replace(order, edits=CORRECTED["edits"]).with_drawn_on()
+    assert "view 1: 1 stroke of the user erases vessel" in again(engine, told).notes
 
 
 def again(engine, order, **change):

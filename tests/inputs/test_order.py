@@ -67,6 +67,9 @@ def orders(draw) -> Order:
         same_branch=draw(st.none() | st.tuples(landmark)),
         ostia=draw(st.none() | st.tuples(landmark)),
         deleted_mm=draw(st.none() | st.tuples(_places)),
+        drawn_on=draw(
+            st.dictionaries(numbers, st.text("0af", min_size=64, max_size=64), max_size=2)
+        ),
         frames=draw(st.none() | st.lists(st.none() | st.integers(1, 900), min_size=1).map(tuple)),
         pixel_spacing_mm=draw(st.none() | st.floats(0.02, 10)),
         sod_mm=draw(st.none() | st.floats(300, 5000)),
@@ -161,6 +164,8 @@ BASE = {"views": ["a", "b"]}
         ({"lesions": [{"view": 3, "proximal": [1, 2], "distal": [3, 4]}]}, "lesions.view = 3"),
         ({"lesions": [{"view": 1, "proximal": [1, 2]}]}, "has no distal"),
         ({"lesions": [{"view": 1, "proximal": [1], "distal": [3, 4]}]}, "column, row"),
+        ({"drawn_on": {"3": "0" * 64}}, "drawn_on 3: there are views 1 .. 2"),
+        ({"drawn_on": {"1": "0" * 63}}, "must be 64 digits"),
         ({"frames": [0]}, "frames = 0"),
         ({"frames": 7}, "list of frames"),
         ({"frames": [1.5]}, "whole number"),

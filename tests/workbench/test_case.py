@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.errors import GcarError
+from gcar_deploy.inputs.order import load_order
 from gcar_deploy.workbench.desk import Desk
 
 
@@ -32,6 +34,16 @@ def test_a_run_that_was_replaced_is_read_anew(desk, tmp_path):
     path.unlink()
     with pytest.raises(GcarError):
         case.run_of(1)
+
+
+def test_the_order_says_which_pictures_were_drawn_on(desk):
+    case = desk.demo()
+    assert "drawn_on" not in case.order.to_dict()
+    case.correct({"ostia": [[[200, 200], [200, 200]]]})
+    digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in case.ready_order.views]
+    assert load_order(case.order_file).drawn_on == dict(enumerate(digests, start=1))
+    case.correct({"ostia": None})
+    assert "drawn_on" not in case.order.to_dict()
 
 
 def test_a_request_gets_its_own_pictures_whatever_others_read_meanwhile(desk, monkeypatch):
