@@ -181,9 +181,13 @@ def _lumen(
 
 
 def _between(own: Sections, share: Scalars, low: float, high: float) -> Spot:
-    """Sections where the vessel is narrowest between two borders, and those of the borders."""
+    """Sections where the vessel is narrowest between two borders, and those of the borders.
+
+    What no view shows, as within a fork, is narrowest only where nothing else lies between.
+    """
     inside = np.flatnonzero((own.arc_mm >= low) & (own.arc_mm <= high))
-    return int(inside[np.argmin(share[inside])]), int(inside[0]), int(inside[-1])
+    shown = inside[own.measured[inside]] if own.measured[inside].any() else inside
+    return int(shown[np.argmin(share[shown])]), int(inside[0]), int(inside[-1])
 
 
 def bifurcation_angles(tree: Tree) -> tuple[BifurcationAngle, ...]:

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gcar_deploy import reconstruction
+from gcar_deploy.config import LesionBorders
 from gcar_deploy.measure.lumen import foreshortening
 from gcar_deploy.measure.measured import measured, residuals
 from gcar_deploy.tree.tree import empty_tree
@@ -81,6 +82,19 @@ def test_residuals_are_distances_to_the_nearest_pixel_of_the_skeleton(result):
     np.testing.assert_allclose(residuals(points, view), expected, rtol=0.03, atol=1e-6)
     far = points + 1000.0 * view.carm.axes[0]
     assert np.isnan(residuals(far, view)).all()
+
+
+def test_a_marked_lesion_is_said_to_be_the_users(result):
+    k = int(np.argmax([branch.length_mm for branch in result.tree.branches]))
+    branch, carm = result.tree.branches[k], result.views[0].carm
+    ends = branch.points_mm[[len(branch) // 3, 2 * len(branch) // 3]]
+    proximal, distal = (tuple(pixel.tolist()) for pixel in carm.project(ends)[0])
+    marks = (LesionBorders(view=1, proximal=proximal, distal=distal),)
+    made = measured(result.tree, result.views, marks=marks)
+    (lesion,) = (one for one in made.lumens[k].lesions if one.marked)
+    first, last = lesion.lesion_mm
+    said = f"of the user: borders of a lesion of branch {k + 1}, {first:.1f} - {last:.1f} mm"
+    assert made.on_marks[0].split(";")[0] == said and last - first > 5
 
 
 def test_an_empty_tree_has_nothing_to_measure(result):

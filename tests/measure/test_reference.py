@@ -75,17 +75,23 @@ def test_three_segments_meet_at_a_bifurcation():
     assert node.calibre_ratio == pytest.approx(3.6 / (3.0 + side), rel=0.02)
 
 
-def marks_at(tree, k, *stretches):
-    """Borders in view 2 of so many stretches of a branch, mm from its inlet."""
-    line, (_, carm) = tree.branches[k], two_views()
-    pixels = [carm.project(along(line.points_mm, line.arc_mm, np.array(s)))[0] for s in stretches]
-    return [LesionBorders(view=2, proximal=tuple(a), distal=tuple(b)) for a, b in pixels]
+def place(tree, k, at_mm):
+    """Pixel in view 2 of a branch so far from its inlet."""
+    line = tree.branches[k]
+    points = along(line.points_mm, line.arc_mm, np.array([at_mm]))
+    return tuple(two_views()[1].project(points)[0][0].tolist())
+
+
+def mark(tree, proximal, distal):
+    """Lesion between two (branch, mm from its inlet)."""
+    ends = place(tree, *proximal), place(tree, *distal)
+    return LesionBorders(view=2, proximal=ends[0], distal=ends[1])
 
 
 def with_marks(tree, k, *stretches):
     """Lumen of a branch with so many lesions marked."""
-    sections = sections_of_radii(tree)
-    marked, missed = marked_lesions(tree, sections, two_views(), marks_at(tree, k, *stretches))
+    sections, marks = sections_of_radii(tree), [mark(tree, (k, a), (k, b)) for a, b in stretches]
+    marked, missed = marked_lesions(tree, sections, two_views(), marks)
     assert missed == () and list(marked) == [k]
     return tree_lumens(tree, sections, marked)[k]
 
@@ -122,10 +128,38 @@ def test_a_mark_beside_the_narrowest_place_cuts_a_found_lesion():
     assert grave.lesion_mm[1] == own.lesion_mm[0] == pytest.approx(22, abs=0.6)
 
 
+def test_a_marked_lesion_that_crosses_a_fork_has_a_part_in_each_branch():
+    tree = bifurcated(narrow=(1, 5.0, 6.0, 0.5))
+    sections = sections_of_radii(tree)
+    for ends in (((0, 24.0), (1, 9.0)), ((1, 9.0), (0, 24.0))):
+        marked, said = marked_lesions(tree, sections, two_views(), [mark(tree, *ends)])
+        assert said == (
+            "lesion 1 crosses a fork: its parts in branches 1, 2 are measured each by itself",
+        )
+        (trunk,), (main,) = marked[0], marked[1]
+        assert sorted(marked) == [0, 1] and trunk == pytest.approx((24, 30), abs=0.6)
+        assert main == pytest.approx((0, 9), abs=0.6)
+        first, second, _ = tree_lumens(tree, sections, marked)
+        # Each part against the reference of its own side of the fork.
+        assert first.stenosis_percent < 2
+        assert second.stenosis_percent == pytest.approx(50, abs=3)
+
+
+def test_borders_that_bound_no_vessel_are_said_for_what_they_are():
+    tree = bifurcated()
+    sections = sections_of_radii(tree)
+    for ends, words in (
+        (((1, 15.0), (2, 15.0)), "lie on branches 2 and 3, neither of which leads to the other"),
+        (((1, 15.0), (1, 15.0)), "both its borders are one place of branch 2"),
+    ):
+        marked, (said,) = marked_lesions(tree, sections, two_views(), [mark(tree, *ends)])
+        assert not marked and said.startswith("lesion 1: ") and words in said
+
+
 def test_a_mark_beside_every_vessel_is_said():
     tree = bifurcated()
-    mark = LesionBorders(view=1, proximal=(2.0, 2.0), distal=(4.0, 2.0))
-    marked, missed = marked_lesions(tree, sections_of_radii(tree), two_views(), (mark,))
+    beside = LesionBorders(view=1, proximal=(2.0, 2.0), distal=(4.0, 2.0))
+    marked, missed = marked_lesions(tree, sections_of_radii(tree), two_views(), (beside,))
     assert not marked and "lesion 1: no branch passes" in missed[0]
 
 
