@@ -23,8 +23,8 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
     -------
     ``branches``: per branch its number, points (mm LPS), arc, radius, reference diameter's half
     (None near the ends), sigma, probability of a ghost, per view the place in the picture and the
-    residual (mm, None outside), colour, least diameter, lesion, further ones, and what it narrows
-    to where that is none; ``views``: directions of the views, then the best further one;
+    residual (mm, None outside), colour, gravest narrowing, lesion, further ones, and what it
+    narrows to where that is none; ``views``: directions of the views, then the best further one;
     ``longest``: the branch to begin with
     """
     points = len(result.tree.points())

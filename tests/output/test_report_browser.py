@@ -211,7 +211,11 @@ def test_the_lesion_that_is_said_is_the_one_that_is_shaded(opened, result):
     row = page.locator(f"tbody tr[data-branch='{marked.measured.lumens.index(lumen) + 1}']")
     row.click()
     page.mouse.move(5, 5)
-    assert f"lesion {lumen.lesion_length_mm:.1f} mm" in page.text_content("#point")
+    said = page.text_content("#point")
+    # Of the narrowing: the branch may taper to less elsewhere.
+    where = f"{lumen.minimal_diameter_mm:.2f} mm at {lumen.minimal_at_mm:.1f} mm"
+    assert said.startswith(f"Gravest narrowing: {where}")
+    assert f"lesion {lumen.lesion_length_mm:.1f} mm" in said
     width = page.eval_on_selector("#curve", "e => e.clientWidth")
     ends = 44 + (width - 54) * np.array(lumen.lesion_mm) / branch.length_mm
     assert opaque(page, "#curve", [(x, 30) for x in (ends[0] + 3, ends.mean(), ends[1] - 3)])

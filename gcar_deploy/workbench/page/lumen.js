@@ -3,7 +3,7 @@ import { $, colorOf, el, inside, nameOf, pen, ring } from "./dom.js";
 
 const fixed = (value, digits) => value === null || value === undefined ? "\u2013" : value.toFixed(digits);
 const COLUMNS = [
-  ["Vessel", ""], ["Stenosis", "% diameter"], ["", "% area"], ["Least", "mm"], ["Reference", "mm (proximal, distal)"],
+  ["Vessel", ""], ["Stenosis", "% diameter"], ["", "% area"], ["Narrowing", "mm"], ["Reference", "mm (proximal, distal)"],
   ["Lesion", "mm"], ["From ostium", "mm"], ["Length", "mm"], ["Ghost", "%"], ["", ""],
 ];
 export const area = percent => percent === null ? null : 100 * (1 - (1 - percent / 100) ** 2);
@@ -138,7 +138,7 @@ export class Curve {
       ctx.strokeStyle = "#8a6d00"; ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(s), top); ctx.lineTo(x(s), bottom); ctx.stroke();
       ring(ctx, x(s), y(2 * part.branch.radius[cursor.at]), 5, "#ffe14d", "#1a2230");
     }
-    $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: least diameter; shaded: lesion.";
+    $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: gravest narrowing; shaded: lesion.";
   }
   axes(ctx, { from, left, right, top, bottom, most, length, x, y }) {
     ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = "#525c6b"; ctx.strokeStyle = "#e3e8ee"; ctx.lineWidth = 1;
