@@ -27,6 +27,7 @@ from gcar_deploy.measure import (
     joined_over_lesions,
     measure_sections,
     read_signal,
+    thin_ostia,
     with_diameters,
 )
 from gcar_deploy.pose import landmark_pixels, marked_places, register
@@ -192,7 +193,10 @@ def _reconstructed(
         losses=refined.losses, predictor=centers.points.source, refiner=refined.refiner,
         model=None if predictor is None else predictor.model.label,
         segmenter=None if vessels.segmenter is None else vessels.segmenter.session.model.label,
-        notes=(*_marks(options, len(missed), len(idle)), *_outside(tree, grid)),
+        notes=(
+            *_marks(options, len(missed), len(idle)), *thin_ostia(tree, ostia),
+            *_outside(tree, grid),
+        ),
         options=options, ending=refined.ending,
         close_calls=refined.close_calls,
     )  # fmt: skip

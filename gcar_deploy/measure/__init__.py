@@ -1,7 +1,7 @@
 """What is measured of a finished tree: inlets, lumen, names, angles, the view to take next."""
 
 from gcar_deploy.measure.bridges import joined_over_lesions
-from gcar_deploy.measure.inlet import from_inlets, idle_ostia
+from gcar_deploy.measure.inlet import from_inlets, idle_ostia, thin_ostia
 from gcar_deploy.measure.lumen_tree import lumen_tree
 from gcar_deploy.measure.measured import Measured, measured
 from gcar_deploy.measure.naming import BranchName
@@ -19,5 +19,6 @@ __all__ = [
     "measure_sections",
     "measured",
     "read_signal",
+    "thin_ostia",
     "with_diameters",
 ]

@@ -30,6 +30,8 @@ _SAME_MM = 1e-6
 #: a marked ostium and the end of its artery may be so far apart: pictures seldom show the very
 #: mouth, and a click is off by a pixel or two
 MARKED_MM = 15.0
+#: arteries taper: a free end so many times as thick as a marked ostium is worth a word
+THICKER = 1.5
 
 
 def from_inlets(tree: Tree, marked_mm: Points | None = None) -> Tree:
@@ -79,6 +81,22 @@ def idle_ostia(tree: Tree, marked_mm: Points) -> list[str]:
         for number, place in enumerate(marked_mm, start=1)
         if _end_at(tree, free, place) is None
     ]
+
+
+def thin_ostia(tree: Tree, marked_mm: Points) -> list[str]:
+    """Return a sentence (a note) for each marked ostium whose artery has a much thicker end."""
+    free, component, out = end_radii(tree), tree.components(), []
+    for number, place in enumerate(marked_mm, start=1):
+        node = _end_at(tree, free, place)
+        if node is None:
+            continue
+        most = max(r for n, r in free.items() if component[n] == component[node])
+        if most > THICKER * free[node]:
+            out.append(
+                f"ostium {number}: the vessel is {2 * free[node]:.1f} mm wide there, and "
+                f"{2 * most:.1f} mm at another free end: was the far end marked?"
+            )
+    return out
 
 
 def _end_at(tree: Tree, free: Mapping[int, float], place_mm: Points) -> int | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcar_deploy.measure.inlet import from_inlets, inlets
+from gcar_deploy.measure.inlet import from_inlets, inlets, thin_ostia
 from gcar_deploy.measure.naming import read_anatomy
 from gcar_deploy.tree.tree import Tree, empty_tree
 from tests.measure.test_naming import left_tree, mapped
@@ -48,6 +48,25 @@ def test_a_thick_fork_is_no_inlet_and_a_single_branch_begins_at_its_thick_end():
     out = from_inlets(dataclasses.replace(line, branches=(narrow,)))
     np.testing.assert_array_equal(begin_mm(out), [0, 0, 15])
     assert (np.diff(out.branches[0].radius_mm) < 0).all()
+
+
+def test_an_ostium_marked_at_a_thin_end_is_worth_a_word():
+    tree = fork(radius=(1.8, 1.3, 0.9))
+    thick, tip = tree.branches[0].points_mm[0], tree.branches[2].points_mm[-1]
+    assert thin_ostia(tree, np.array([thick, [500.0, 0, 0]])) == []
+    (said,) = thin_ostia(tree, np.array([thick, tip]))
+    assert said.startswith("ostium 2: the vessel is 1.8 mm wide there, and 3.6 mm at another")
+    # A thick artery of its own says nothing of this one.
+    apart = tree.moved(np.array([300.0, 0, 0]))
+    assert thin_ostia(fork(radius=(1.8, 1.3, 1.3)), np.array([tip])) == []
+    both = Tree(
+        nodes_mm=np.concatenate([tree.nodes_mm, apart.nodes_mm]),
+        branches=(
+            *(dataclasses.replace(b, radius_mm=0 * b.radius_mm + 0.9) for b in tree.branches),
+            *(dataclasses.replace(b, start=b.start + 4, end=b.end + 4) for b in apart.branches),
+        ),
+    )
+    assert thin_ostia(both, np.array([tip])) == []
 
 
 @pytest.mark.parametrize("seed", range(4))
