@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from gcar_deploy.types import Array, Mask
 
 DOES = ("erase", "paint")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 _KEYS = ("do", "width_px", "points")
 #: points of one stroke, strokes of one view
 MOST_POINTS, MOST_STROKES = 2000, 500
@@ -101,6 +103,20 @@ def parse_regions(key: str, value: Any) -> dict[int, tuple[Place, ...]]:
     UsageError, GeometryError
     """
     return {k: _places(f"{key}.{k}", one, 3) for k, one in by_view(key, value, "corners").items()}
+
+
+def parse_digests(key: str, value: Any) -> dict[int, str]:
+    """Read ``{"1": SHA-256, ...}``.
+
+    Raises
+    ------
+    UsageError
+    """
+    found = by_view(key, value, "SHA-256")
+    for k, digest in found.items():
+        if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
+            raise UsageError(f"{key}.{k} = {quote(digest)} must be 64 digits 0 .. f")
+    return found
 
 
 def by_view(key: str, value: Any, of: str) -> dict[int, Any]:

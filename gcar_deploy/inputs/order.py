@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -42,6 +41,7 @@ from gcar_deploy.inputs.drawn import (
     Stroke,
     by_view,
     drawn_by_view,
+    parse_digests,
     parse_edits,
     parse_point,
     parse_regions,
@@ -54,7 +54,6 @@ MAX_BYTES = 16 * 1024 * 1024
 _FARTHEST_MM = 2000.0
 #: no picture or run that is read is larger
 _MOST_BYTES = 2**40
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 POSES = ("auto", "off")
 #: further file that an order may ask for -> its name in the result folder
 EXTRAS = {"glb": "surface.glb", "dicom-stl": "surface.dcm"}
@@ -72,7 +71,7 @@ class Order:
     views : files of pictures or DICOM runs, in the order of the geometry's views
     geometry : file or content of a ``geom.json``; None where DICOM headers tell it
     masks : number of the view, from 1 -> file of its vessel mask
-    landmarks : points marked in the pictures, (column, row) in each view or None
+    landmarks : points marked, (column, row) in each view or None; the last views may be left out
     edits : number of the view, from 1 -> strokes that erase or paint vessel, in their order
     regions : number of the view -> corners of the part that is looked at
     same_branch : a place on one vessel in each view, not the same place of it, or None
@@ -189,6 +188,8 @@ class Order:
         """Return ``base`` with what this order chooses."""
         dicom = _given(self, "frames", "pixel_spacing_mm", "sod_mm")
         pose = {} if self.pose is None else {"enabled": self.pose == "auto"}
+        points = _given(self, "landmarks", "same_branch", "ostia")
+        marks: dict[str, Any] = {key: self._per_view(own) for key, own in points.items()}
         return dataclasses.replace(
             base,
             dicom=dataclasses.replace(base.dicom, **dicom),
@@ -200,7 +201,15 @@ class Order:
             pose=dataclasses.replace(base.pose, **pose),
             predict=dataclasses.replace(base.predict, **_given(self, "predictor")),
             refine=dataclasses.replace(base.refine, **_given(self, "refiner")),
-            **_given(self, "landmarks", "lesions", "same_branch", "ostia", "deleted_mm"),
+            **_given(self, "lesions", "deleted_mm"),
+            **marks,
+        )
+
+    def _per_view(self, marks: tuple[Landmark, ...]) -> tuple[Landmark, ...]:
+        """Points of every view: in those that were added later nothing is marked."""
+        count = len(self.views)
+        return tuple(
+            (*one, *(None,) * (count - len(one))) if len(one) > 1 else one for one in marks
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -294,7 +303,7 @@ def _order(values: Any) -> Order:
         "geometry": _geometry, "masks": _masks, "landmarks": _landmarks, "frames": _frames,
         "edits": parse_edits, "regions": parse_regions, "ostia": _landmarks,
         "same_branch": _landmarks,
-        "deleted_mm": _deleted, "lesions": _lesions, "drawn_on": _digests,
+        "deleted_mm": _deleted, "lesions": _lesions, "drawn_on": parse_digests,
         "pixel_spacing_mm": number, "sod_mm": number, "deadline_s": number, "strict": _truth,
         "force": _truth, "allow_rescale": _truth, "out": _path, "extras": _texts,
     }  # fmt: skip
@@ -333,14 +342,6 @@ def _geometry(key: str, value: Any) -> Any:
 
 def _masks(key: str, value: Any) -> dict[int, Path]:
     return {k: _path(f"{key}.{k}", name) for k, name in by_view(key, value, "file").items()}
-
-
-def _digests(key: str, value: Any) -> dict[int, str]:
-    found = by_view(key, value, "SHA-256")
-    for k, digest in found.items():
-        if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
-            raise UsageError(f"{key}.{k} = {quote(digest)} must be 64 digits 0 .. f")
-    return found
 
 
 def _landmarks(key: str, value: Any) -> tuple[Landmark, ...]:

@@ -32,6 +32,8 @@ from gcar_deploy.inputs.order import (
     order_to_json,
     parse_order,
 )
+from gcar_deploy.pose import landmark_pixels
+from tests.tubes.scenes import two_views
 
 _names = st.text("abcäö 1./-", min_size=1, max_size=12).map(Path)
 _points = st.none() | st.tuples(st.floats(0, 4000), st.floats(0, 4000))
@@ -192,6 +194,21 @@ def test_wrong_orders_name_key_and_value(change, words):
     with pytest.raises(UsageError) as caught:
         parse_order({**BASE, **change})
     assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_points_of_views_that_were_added_later_are_marked_nowhere():
+    marks = [[[1, 2], [3, 4]], [None, [5, 6], [7, 8]]]
+    three = {"views": ["a", "b", "c"], "landmarks": marks, "ostia": marks[:1]}
+    options = parse_order(three).options(RunOptions())
+    assert options.landmarks == (
+        ((1.0, 2.0), (3.0, 4.0), None), (None, (5.0, 6.0), (7.0, 8.0)),
+    )  # fmt: skip
+    assert options.ostia == options.landmarks[:1]
+    # Points of views that are not there, and one alone, stay a wrong call.
+    for wrong in (marks, [[[1, 2]]]):
+        two = parse_order({**BASE, "landmarks": wrong}).options(RunOptions())
+        with pytest.raises(UsageError, match="points for 2 views"):
+            landmark_pixels(two.landmarks, two_views())
 
 
 def test_relative_paths_of_a_file_begin_at_its_folder(tmp_path):
