@@ -2,7 +2,7 @@
 
 Cells a little narrower than the thin vessels; finer ones cost more and tell little more. Thick
 vessels, and predictors that were trained on coarse cells alone, keep the cells of the volume asked
-for.
+for, or the usual ones.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.types import Array, Scalars
 
+#: cells where nobody names a volume, and pixels are no wider, mm
+USUAL_CELL_MM = 1.0
 #: a vessel is thin whose radius so large a share of the lines does not reach
 THIN_SHARE = 0.15
 #: cells are so many times the thin vessels' radius wide. Chosen on three generated thin trees
@@ -71,12 +73,14 @@ def resolution(
         ``path_cells`` the thresholds of the hull, by default the one of ``options`` alone
     """
     o, usual = options.predict, options.candidates.min_path_cells
-    own = float(np.clip(np.mean(grid.spacing_mm), o.min_cell_mm, o.max_cell_mm))
+    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
+    # Where nobody named a volume its size is that of the pictures: a border would change the cells.
+    wanted = np.mean(grid.spacing_mm) if grid.bounds else max(USUAL_CELL_MM, pixel)
+    own = float(np.clip(wanted, o.min_cell_mm, o.max_cell_mm))
     least = max(_least(spec, "spacing_mm", o.min_cell_mm), o.thin_cell_mm)
     if least >= o.min_cell_mm:
         return Resolution(own, own, usual)
     thin = _thin_radius_mm(views)
-    pixel = max(view.carm.pixel_at_isocenter_mm for view in views)
     cell = float(np.clip(CELL_RADII * thin, min(max(least, pixel), own), own))
     path = PATH_SHARE * np.pi * (thin / cell) ** 2
     low = min(_least(spec, "path_cells", usual), usual)

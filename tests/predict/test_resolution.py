@@ -79,6 +79,18 @@ def test_thick_vessels_and_coarse_pixels_cost_what_they_did() -> None:
     assert known.cell_mm == 0.6 and known.min_path_cells == 0.5
 
 
+@pytest.mark.parametrize("known", [FINE, None])
+@pytest.mark.parametrize("radius_mm", [0.4, 1.2])
+def test_without_a_volume_the_field_of_the_pictures_sets_no_cells(radius_mm: float, known) -> None:
+    fields = [dataclasses.replace(GRID, size_mm=(edge,) * 3, bounds=False)
+              for edge in (109.0, 126.7, 129.2, 200.0)]  # fmt: skip
+    found = {resolution(views(radius_mm), field, OPTIONS, known) for field in fields}
+    assert len(found) == 1
+    asked = dataclasses.replace(fields[-1], bounds=True)
+    assert resolution(views(1.2), asked, OPTIONS, known).cell_mm > 1.4
+    assert resolution(views(1.2, 1.3), fields[0], OPTIONS, known).cell_mm == pytest.approx(1.3)
+
+
 def test_too_many_points_make_coarser_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     start = resolution(views(0.25), GRID, OPTIONS, FINE)
     assert start.coarser(room.MOST_POINTS) is None
