@@ -258,10 +258,16 @@ def test_tools_write_what_they_say(serve, browse):
 
 
 @pytest.mark.slow
-def test_one_press_of_delete_deletes_one_branch(serve, browse):
+def test_delete_acts_on_a_chosen_branch_and_once(serve, browse):
+    """The page shows one from the beginning: nobody chose it, so that no key deletes it."""
     address, cases = serve(lambda desk: desk.demo().id)
     page = browse(address, 1500)
     finished(page)
+    assert page.locator("#lesions tr.chosen").count() == 1
+    page.keyboard.press("Delete")
+    assert "click one first" in page.inner_text("#message")
+    page.wait_for_timeout(300)
+    assert "deleted_mm" not in order_of(cases / "demo")
     page.locator("#lesions tbody tr[data-branch='5'] button.plain").click()
     page.keyboard.press("Delete")
     page.keyboard.press("Delete")

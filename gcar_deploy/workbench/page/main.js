@@ -184,7 +184,8 @@ window.addEventListener("keydown", e => {
   else if (key === "escape") tools.take("look");
   else if (key === "enter" && tools.corners) tools.finish(null);
   else if (key === "h") { $("show-tree").click(); }
-  else if (key === "delete" && store.branch(store.chosen)) erase(store.branch(store.chosen));
+  else if (key === "delete" && store.picked) erase(store.picked);
+  else if (key === "delete" && store.result) say("Delete acts on a branch that you chose: click one first.");
 });
 
 attempt(start);

@@ -14,7 +14,7 @@ export class Store extends EventTarget {
   /** Place of a deleted branch -> the name that it had. */
   gone = new Map();
   info = null; result = null; job = null; running = false;
-  chosen = 0; cursor = null; spot = null; ran = null; #past = []; #future = []; #runs = 0; #last = Promise.resolve();
+  chosen = 0; cursor = null; spot = null; ran = null; #past = []; #future = []; #runs = 0; #picked = false; #last = Promise.resolve();
 
   get path() { return `/api/cases/${this.info.id}`; }
   get now() { return corrections(this.info.order); }
@@ -22,6 +22,8 @@ export class Store extends EventTarget {
   get canRedo() { return this.#future.length > 0; }
   /** Whether the result was made without the corrections of now. */
   get stale() { return this.ran !== null && !same(this.ran, this.now); }
+  /** The chosen branch where the user chose it, null where the page did: what Delete may act on. */
+  get picked() { return this.#picked ? this.branch(this.chosen) : null; }
 
   /** A sentence with the names that the user's files had. */
   words(text) {
@@ -32,7 +34,7 @@ export class Store extends EventTarget {
   tell(what) { this.dispatchEvent(new Event(what)); }
 
   open(info) {
-    this.#runs++; this.running = false;
+    this.#runs++; this.running = this.#picked = false;
     Object.assign(this, { info, result: null, job: null, ran: null, chosen: 0, cursor: null, spot: null, told: info.order.geometry ?? null });
     this.#past.length = 0; this.#future.length = 0;
     this.tell("opened");
@@ -126,6 +128,7 @@ export class Store extends EventTarget {
         // Branches are numbered anew: the chosen one is known by its place. What was deleted
         // leaves none chosen, so that no second key deletes another.
         if (result) this.chosen = before ? again(result.scene.branches, chosen) : worst(result.scene.branches);
+        this.#picked &&= before !== null;
         this.cursor = this.spot = null;
       }
       this.tell("finished");
@@ -141,11 +144,14 @@ export class Store extends EventTarget {
     if (this.job && this.running) await api.remove(`/api/jobs/${this.job.id}`);
   }
 
-  choose(branch) { this.chosen = branch; this.cursor = this.spot = null; this.tell("chosen"); }
+  choose(branch) { this.chosen = branch; this.#picked = true; this.cursor = this.spot = null; this.tell("chosen"); }
   /** A point of a branch that all drawings mark: its number and the place in its list. */
   point(cursor) { this.cursor = cursor; this.tell("chosen"); }
   /** A stated alternative, whose place all drawings mark. */
-  show(spot) { if (spot.branches.length) this.chosen = spot.branches[0]; this.cursor = null; this.spot = spot; this.tell("chosen"); }
+  show(spot) {
+    if (spot.branches.length) { this.chosen = spot.branches[0]; this.#picked = false; }
+    this.cursor = null; this.spot = spot; this.tell("chosen");
+  }
   branch(number) { return this.result?.scene.branches.find(b => b.branch === number) ?? null; }
 }
 
