@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ import numpy as np
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.output.colors import branch_color
 from gcar_deploy.output.words import LEFT_OUT, explained
 from gcar_deploy.quality import PROBABLE, ViewQuality
 from gcar_deploy.tree.tree import Tree, along, polyline_arc
@@ -37,15 +37,6 @@ if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # OpenCV 4.12 or newer
     _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
 #: branches shorter than this on the screen get no number, numbers keep this distance, pixels
 _NUMBER_GAP = 30
-
-
-def branch_color(number: int) -> tuple[int, int, int]:
-    """Return the colour (blue, green, red) of a branch; the same in the report."""
-    # Golden-ratio steps keep neighbouring numbers far apart on the colour circle; red is left
-    # out, since it marks what the tree does not explain.
-    hue = 0.10 + 0.80 * ((0.45 + number * 0.618034) % 1.0)
-    red, green, blue = colorsys.hsv_to_rgb(hue, 0.65, 1.0)
-    return round(blue * 255), round(green * 255), round(red * 255)
 
 
 def grey8(pixels: Image) -> Array:

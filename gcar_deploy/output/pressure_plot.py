@@ -7,7 +7,7 @@ import html
 import numpy as np
 
 from gcar_deploy.flow import PressureDrop, VesselPressure
-from gcar_deploy.output.overlay import branch_color
+from gcar_deploy.output.colors import branch_color, css
 from gcar_deploy.types import Array
 
 _WIDTH, _HEIGHT = 760, 344
@@ -78,13 +78,14 @@ def _curve(k: int, vessel: VesselPressure, x, y) -> list[str]:  # type: ignore[n
     """Band, line and number of one branch."""
     keep = np.flatnonzero(vessel.told)
     keep = keep[np.unique(np.linspace(0, len(keep) - 1, min(len(keep), _POINTS)).astype(int))]
-    blue, green, red = branch_color(k)
-    color = f"rgb({red},{green},{blue})"
+    color = css(branch_color(k)[::-1])
     at = x(vessel.arc_mm[keep])
     low, high, middle = (y(np.maximum(v[keep], 0)) for v in (vessel.low, vessel.high, vessel.ratio))
     band = _path(np.concatenate([at, at[::-1]]), np.concatenate([high, low[::-1]]))
     return [
         f'<path d="{band}Z" fill="{color}" fill-opacity="0.15"/>',
+        # A dark edge: light colours are hardly seen on paper.
+        f'<path d="{_path(at, middle)}" fill="none" stroke="#1c2430" stroke-width="3.5"/>'
         f'<path d="{_path(at, middle)}" fill="none" stroke="{color}" stroke-width="2"/>',
         f'<text x="{at[-1] - 2:.1f}" y="{middle[-1] - 4:.1f}" text-anchor="end">{k + 1}</text>',
     ]

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 
 from gcar_deploy.errors import GcarError
+from gcar_deploy.output.colors import SCALE, css
 from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.words import LEFT_OUT, explained
@@ -74,6 +75,8 @@ def report_html(
         "TIMINGS": _rows({k: f"{v:.2f} s" for k, v in summary["seconds"].items()}),
         "PROVENANCE": _rows(_provenance(summary)),
         "USE": html.escape(str(summary["use"])),
+        "LOW": css(SCALE[0]),
+        "HIGH": css(SCALE[1]),
         "DATA": _embedded(scene_data(result)),
     }
     # One pass: a name of a view that looks like a mark is text.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.output.overlay import branch_color
+from gcar_deploy.output.colors import SCALE, UNKNOWN, branch_color, css
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.types import Scalars
 
@@ -25,7 +25,8 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
     (None near the ends), sigma, probability of a ghost, per view the place in the picture and the
     residual (mm, None outside), colour, gravest narrowing, lesion, further ones, and what it
     narrows to where that is none; ``views``: directions of the views, then the best further one;
-    ``longest``: the branch to begin with
+    ``longest``: the branch to begin with; ``scale``: both ends of the colours of a measure,
+    ``unknown``: the colour of what has none
     """
     points = len(result.tree.points())
     stride = max(1, -(-points * (8 + 3 * len(result.views)) // _NUMBERS))
@@ -39,6 +40,8 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
         "branches": [_branch(result, k, stride) for k in range(len(lengths))],
         "views": views,
         "places": PLACES,
+        "scale": SCALE,
+        "unknown": css(UNKNOWN),
         "longest": int(np.argmax(lengths)) + 1 if lengths else 0,
     }
 
@@ -47,7 +50,6 @@ def _branch(result: Reconstruction, k: int, stride: int) -> dict[str, Any]:
     branch, lumen, name = result.tree.branches[k], result.measured.lumens[k], result.names[k]
     keep = np.unique([*range(0, len(branch), stride), len(branch) - 1])
     first = sum(len(other) for other in result.tree.branches[:k])
-    blue, green, red = branch_color(k)
     points = branch.points_mm[keep]
     seen = []
     for view, gaps in zip(result.views, result.measured.residual_mm[:, first + keep], strict=True):
@@ -67,7 +69,7 @@ def _branch(result: Reconstruction, k: int, stride: int) -> dict[str, Any]:
         "ghost": _known(result.ghost_probability[k][keep], 2),
         "seen": seen,
         "name": None if name is None else name.name,
-        "color": f"rgb({red},{green},{blue})",
+        "color": css(branch_color(k)[::-1]),
         "least": None
         if lumen.minimal_at_mm is None
         else [round(lumen.minimal_at_mm, 2), round(lumen.minimal_diameter_mm or 0.0, 2)],

@@ -10,7 +10,8 @@ import pytest
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
-from gcar_deploy.output.overlay import backdrop, branch_color, grey8, overlay, png_bytes
+from gcar_deploy.output.colors import branch_color
+from gcar_deploy.output.overlay import backdrop, grey8, overlay, png_bytes
 from gcar_deploy.output.words import LEFT_OUT, explained
 from gcar_deploy.quality.status import ViewQuality, unexplained, view_quality
 from gcar_deploy.tree.tree import Branch, Tree, empty_tree
@@ -107,8 +108,8 @@ def test_grey_stretch():
 
 
 def test_colours_differ_and_leave_red_alone():
-    colors = np.array([branch_color(k) for k in range(12)], float)
-    gap = np.abs(colors[:, None] - colors[None]).max(axis=2)[~np.eye(12, dtype=bool)]
+    colors = np.array([branch_color(k) for k in range(8)], float)
+    gap = np.abs(colors[:, None] - colors[None]).max(axis=2)[~np.eye(8, dtype=bool)]
     assert gap.min() > 15
     assert np.linalg.norm(colors - RED, axis=1).min() > 90
 

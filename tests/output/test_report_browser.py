@@ -160,11 +160,11 @@ def test_the_best_further_view_is_shown(opened, result):
 
 @pytest.mark.slow
 def test_the_tree_lies_on_the_vessels_of_each_picture(opened):
-    """Good fits are green; the lines can be hidden."""
+    """Good fits are blue; the lines can be hidden."""
     page = opened()
     for view in (0, 1):
         found = colors(page, f".lines[data-view='{view}']")
-        assert any(g > 150 and g > 1.5 * r for r, g, _ in found)
+        assert any(b > 190 and b > 2 * r for r, _, b in found)
     page.select_option("#linecolor", "none")
     assert colors(page, ".lines[data-view='0']") == set()
 

@@ -3,45 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import re
-from importlib import resources
 
-import numpy as np
 import pytest
-from skimage.color import rgb2lab
 
 from gcar_deploy.inputs.order import Order
 from tests.conftest import of_data
 from tests.workbench.conftest import finished, nothing_serious, order_of, stroke, until, until_order
-
-#: what people without one kind of cone see, in linear RGB (Machado et al., IEEE Trans Vis Comput
-#: Graph 15:1291, 2009, severity 1)
-VISIONS = {
-    "all cones": np.eye(3),
-    "no red": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
-               [-0.003882, -0.048116, 1.051998]],
-    "no green": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
-                 [-0.011820, 0.042940, 0.968881]],
-    "no blue": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
-                [0.004733, 0.691367, 0.303900]],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("vision", VISIONS)
-def test_branches_are_apart_by_colour_for_everybody(vision):
-    """CIE 1976 distance of the colours, the most of next numbers; 2.3 is just seen."""
-    page = resources.files("gcar_deploy.workbench").joinpath("page", "dom.js").read_text()
-    told = re.search(r"const COLORS = \[(.*)\]", page).group(1)
-    rgb = np.array([list(bytes.fromhex(x)) for x in re.findall(r'"#(\w{6})"', told)]) / 255
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ np.array(VISIONS[vision]).T, 0, 1)
-    shown = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
-    lab = rgb2lab(shown)
-    gap = np.linalg.norm(lab[:, None] - lab[None], axis=-1)
-    assert (
-        min(np.diag(np.roll(gap, -1, axis=1))) > 35
-        and gap[~np.eye(len(lab), dtype=bool)].min() > 15
-    )
 
 
 def test_runs_whose_headers_lack_the_pixel_are_asked_for_it(serve, browse):

@@ -66,10 +66,6 @@ export function ring(ctx, x, y, radius, color, dark = "#000") {
   }
 }
 
-// Of Tol's and of Okabe and Ito's colours, in an order in which neighbours are apart for all kinds of colour vision.
-const COLORS = ["#eedd88", "#66ccee", "#ee3377", "#bbcc33", "#ffaabb", "#3d8fdb", "#d55e00", "#cc79a7"];
-export const colorOf = branch => COLORS[(branch - 1) % COLORS.length];
-
 /** Name of a branch: its number, and its vessel where anatomy tells it. */
 export const nameOf = branch => branch.name ? `${branch.branch} ${branch.name}` : String(branch.branch);
 

@@ -1,5 +1,5 @@
 // The table of narrowings, and the diameter along a vessel from the ostium to its tip.
-import { $, colorOf, el, inside, nameOf, pen, ring } from "./dom.js";
+import { $, el, inside, nameOf, pen, ring } from "./dom.js";
 
 const fixed = (value, digits) => value === null || value === undefined ? "\u2013" : value.toFixed(digits);
 const COLUMNS = [
@@ -34,7 +34,7 @@ export function table(store, erase) {
     const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
       // Rounded down: what is not certain never reads 100 %.
       row.name ? el("small", { title: "probability of the name by anatomy" }, ` ${Math.floor(100 * row.name_confidence)} %`) : "");
-    jump.querySelector(".swatch").style.background = colorOf(branch.branch);
+    jump.querySelector(".swatch").style.background = branch.color;
     const drop = el("button", { type: "button", class: "small", "aria-label": `Delete branch ${branch.branch}`, title: "Delete this branch (Delete)", onclick: e => { e.stopPropagation(); erase(branch); } }, "Delete");
     return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : rank >= FEW && percent < SLIGHT && !row.lesion_length_mm ? "slight" : "", onclick: () => jumpTo(store, branch) },
       el("td", {}, jump), ...cells.map(content => el("td", {}, content)), el("td", {}, drop));

@@ -1,5 +1,5 @@
 // One angiogram: picture, vessels found, strokes, marks and the tree over it; zoom and pan.
-import { colorOf, el, gapAt, inside, nameOf, names, pen, ring, saved } from "./dom.js";
+import { el, gapAt, inside, nameOf, names, pen, ring, saved } from "./dom.js";
 
 const LENS = 70;
 
@@ -152,10 +152,10 @@ export class Picture {
     for (const [branch, at] of lines) draw(branch, at, wide + 2.5, "#000b");
     for (const [branch, at] of lines) {
       const chosen = branch.branch === store.chosen;
-      draw(branch, at, chosen ? wide + 1.5 : wide, colorOf(branch.branch));
+      draw(branch, at, chosen ? wide + 1.5 : wide, branch.color);
     }
     names(ctx, [...lines].sort(([a], [b]) => (b.branch === store.chosen) - (a.branch === store.chosen))
-      .map(([branch, at]) => [nameOf(branch), at, branch.branch === store.chosen ? "#fff" : colorOf(branch.branch)]));
+      .map(([branch, at]) => [nameOf(branch), at, branch.branch === store.chosen ? "#fff" : branch.color]));
     if (store.spot) ring(ctx, ...this.put(store.spot.at[this.number - 1]), 11, "#f0e442");
     const cursor = store.cursor && lines.find(([b]) => b.branch === store.cursor.branch);
     if (cursor) ring(ctx, ...cursor[1][store.cursor.at], 6, "#ffe14d");

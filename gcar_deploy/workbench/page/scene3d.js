@@ -1,11 +1,11 @@
 // The tree in 3D, seen from the detector of a C-arm that is turned by dragging.
-import { colorOf, direction, el, gapAt, inside, label, nameOf, names, pen, ring, saved } from "./dom.js";
+import { direction, el, gapAt, inside, label, nameOf, names, pen, ring, saved } from "./dom.js";
 
 const rad = x => x * Math.PI / 180;
 const dot = (p, q) => p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
 /** A colour made darker (light < 1), and mixed with white. */
 function shade(color, light, white = 0) {
-  const parts = color.startsWith("#") ? [1, 3, 5].map(k => parseInt(color.slice(k, k + 2), 16)) : color.match(/\d+/g).map(Number);
+  const parts = color.match(/\d+/g).map(Number);
   return `rgb(${parts.map(x => Math.round(light * (x + (255 - x) * white))).join(",")})`;
 }
 const wrap = x => ((x + 180) % 360 + 360) % 360 - 180;
@@ -130,17 +130,16 @@ export class Scene3D {
   }
   /** Colour of a piece; blue to yellow, which all kinds of colour vision tell apart. */
   paint() {
-    const kind = this.kind;
-    if (kind === "branch") return branch => colorOf(branch.branch);
+    const kind = this.kind, { scale, unknown } = this.store.result.scene;
+    if (kind === "branch") return branch => branch.color;
     const factor = kind === "radius" ? 2 : 1;
     const all = this.store.result.scene.branches.flatMap(b => b[kind]).filter(x => x !== null).map(x => factor * x);
     this.limits = all.length ? [Math.min(...all), Math.max(...all)] : null;
     return (branch, i) => {
       const value = branch[kind][i];
-      if (value === null || !this.limits) return "#8a94a3";
+      if (value === null || !this.limits) return unknown;
       const t = (factor * value - this.limits[0]) / (this.limits[1] - this.limits[0] || 1);
-      const mix = (a, b) => Math.round(a + (b - a) * t);
-      return `rgb(${mix(40, 253)},${mix(110, 231)},${mix(220, 37)})`;
+      return `rgb(${scale[0].map((x, k) => Math.round(x + (scale[1][k] - x) * t))})`;
     };
   }
   compass(ctx, u, v, height) {
