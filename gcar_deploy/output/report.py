@@ -19,6 +19,7 @@ from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.output.report_data import scene_data
 from gcar_deploy.output.words import LEFT_OUT, explained
 from gcar_deploy.reconstruction import Reconstruction
+from gcar_deploy.tree.rooted import inlet_arcs
 from gcar_deploy.types import Array
 
 _TEMPLATE = "report_template.html"
@@ -45,6 +46,7 @@ def report_html(
     HTML text; scripts and styles inside, allowed by their hashes and nothing else
     """
     template = resources.files("gcar_deploy.output").joinpath(_TEMPLATE).read_text("utf-8")
+    far_mm = inlet_arcs(result.tree)
     parts = {
         "STATUS": html.escape(str(summary["status"])),
         "SENTENCE": html.escape(str(summary["sentence"])),
@@ -64,11 +66,12 @@ def report_html(
             f"<th>view {html.escape(str(view['id']))}</th>" for view in summary["views"]
         ),
         "BRANCHES": "".join(
-            _branch(row, hidden)
-            for row, hidden in zip(
-                summary["tree"]["branches"], result.measured.hidden.tolist(), strict=True
+            _branch(row, hidden, far)
+            for row, hidden, far in zip(
+                summary["tree"]["branches"], result.measured.hidden.tolist(), far_mm, strict=True
             )
         ),
+        "LESIONS": _lesions(summary["tree"]["branches"], far_mm),
         "PRESSURE": pressure_rows(summary),
         "ASSUMED": html.escape(summary["pressure"]["sentence"]),
         "CURVES": pressure_svg(result.pressure).replace(' xmlns="http://www.w3.org/2000/svg"', ""),
@@ -188,7 +191,31 @@ def branch_title(row: Mapping[str, Any]) -> str:
     return f"{row['branch']} {row['name']} ({int(100 * row['name_confidence'])} %)"
 
 
-def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
+def _lesions(rows: Sequence[Mapping[str, Any]], far_mm: Sequence[float | None]) -> str:
+    """One row a lesion, the most severe first."""
+    found = [
+        (one, row, far)
+        for row, far in zip(rows, far_mm, strict=True) for one in row.get("lesions") or ()
+    ]  # fmt: skip
+    out = []
+    for one, row, far in sorted(found, key=lambda told: -told[0]["stenosis_percent"]):
+        start, end = one["lesion_mm"]
+        cells = [
+            branch_title(row), _from_ostium(one["minimal_at_mm"], far), f"{end - start:.1f}",
+            _number(one["minimal_diameter_mm"]), _number(one["reference_diameter_mm"]),
+            f"{one['stenosis_percent']:.0f} %",
+        ]  # fmt: skip
+        columns = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        out.append(f'<tr data-branch="{row["branch"]}">{columns}</tr>')
+    return "".join(out) or '<tr><td colspan="6">none of a quarter and more</td></tr>'
+
+
+def _from_ostium(at_mm: float | None, far_mm: float | None) -> str:
+    """Distance of a place on a branch, mm; of a part that no ostium is known of, none."""
+    return "-" if at_mm is None or far_mm is None else f"{far_mm + at_mm:.0f}"
+
+
+def _branch(row: Mapping[str, Any], hidden: Sequence[float], far_mm: float | None) -> str:
     cells = [
         html.escape(branch_title(row)),
         f"{row['length_mm']:.1f}",
@@ -196,7 +223,8 @@ def _branch(row: Mapping[str, Any], hidden: Sequence[float]) -> str:
         _number(row["minimal_diameter_mm"]),
         _number(row["reference_diameter_mm"]),
         _narrowing(row),
-        "-" if row["lesion_length_mm"] is None else f"{row['lesion_length_mm']:.1f}",
+        _from_ostium(row["minimal_at_mm"], far_mm),
+        f"{row['lesion_length_mm']:.1f}" if row["lesion_length_mm"] else "-",
         _number(row["mean_sigma_mm"]),
         _share(row["ghost_probability"]),
         *(f"{100 * share:.0f} %" for share in hidden),

@@ -8,6 +8,7 @@ import numpy as np
 
 from gcar_deploy.output.colors import SCALE, UNKNOWN, branch_color, css
 from gcar_deploy.reconstruction import Reconstruction
+from gcar_deploy.tree.rooted import inlet_arcs
 from gcar_deploy.types import Scalars
 
 #: numbers in the page, all branches together; a point has eight, and three more a view
@@ -23,10 +24,10 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
     -------
     ``branches``: per branch its number, points (mm LPS), arc, radius, reference diameter's half
     (None near the ends), sigma, probability of a ghost, per view the place in the picture and the
-    residual (mm, None outside), colour, gravest narrowing, lesion, further ones, and what it
-    narrows to where that is none; ``views``: directions of the views, then the best further one;
-    ``longest``: the branch to begin with; ``scale``: both ends of the colours of a measure,
-    ``unknown``: the colour of what has none
+    residual (mm, None outside), colour, distance from the ostium, gravest narrowing, lesion,
+    further ones, and what it narrows to where that is none; ``views``: directions of the views,
+    then the best further one; ``longest``: the branch to begin with; ``scale``: both ends of the
+    colours of a measure, ``unknown``: the colour of what has none
     """
     points = len(result.tree.points())
     stride = max(1, -(-points * (8 + 3 * len(result.views)) // _NUMBERS))
@@ -37,7 +38,10 @@ def scene_data(result: Reconstruction) -> dict[str, Any]:
     if further is not None:
         views.append([further.primary_angle_deg, further.secondary_angle_deg])
     return {
-        "branches": [_branch(result, k, stride) for k in range(len(lengths))],
+        "branches": [
+            {**_branch(result, k, stride), "from_ostium": None if far is None else round(far, 2)}
+            for k, far in enumerate(inlet_arcs(result.tree))
+        ],
         "views": views,
         "places": PLACES,
         "scale": SCALE,

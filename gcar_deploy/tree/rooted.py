@@ -66,6 +66,22 @@ def rooted(tree: Tree, inlets: Sequence[int]) -> Tree:
     )
 
 
+def inlet_arcs(tree: Tree) -> list[float | None]:
+    """Distance of each branch's inlet from the ostium, mm; parents have lower numbers.
+
+    The ostium is the first branch's. None for parts that do not hang on it: how far they are from
+    it, nobody knows.
+    """
+    far: dict[int, float] = {tree.branches[0].start: 0.0} if tree.branches else {}
+    out = []
+    for branch in tree.branches:
+        start = far.get(branch.start)
+        out.append(start)
+        if start is not None:
+            far.setdefault(branch.end, start + branch.length_mm)
+    return out
+
+
 def _distance_mm(tree: Tree, inlets: Sequence[int]) -> Scalars:
     """(k,) way from each node to the nearest inlet, mm; infinite where there is none."""
     shortest: dict[tuple[int, int], float] = {}

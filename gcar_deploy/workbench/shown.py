@@ -29,11 +29,8 @@ _CROSSED_PX = 0.75
 def result_data(result: Result) -> dict[str, Any]:
     """Return tree, lesions, ways from ostium to tip, what else there may be, and the summary."""
     summary = result.summary()
-    start = inlet_arcs(result.tree)
     scene = scene_data(result)
     for branch, row in zip(scene["branches"], summary["tree"]["branches"], strict=True):
-        far = start[branch["branch"] - 1]
-        branch["from_ostium"] = None if far is None else round(far, 2)
         branch["middle"] = middle(result.tree, branch["branch"] - 1)
         branch["row"] = row
     return {
@@ -47,22 +44,6 @@ def middle(tree: Tree, branch: int) -> list[float]:
     one = tree.branches[branch]
     at = int(np.argmin(np.abs(one.arc_mm - 0.5 * one.length_mm)))
     return [round(float(x), 2) for x in one.points_mm[at]]
-
-
-def inlet_arcs(tree: Tree) -> list[float | None]:
-    """Distance of each branch's inlet from the ostium, mm; parents have lower numbers.
-
-    The ostium is the first branch's. None for parts that do not hang on it: how far they are from
-    it, nobody knows.
-    """
-    far: dict[int, float] = {tree.branches[0].start: 0.0} if tree.branches else {}
-    out = []
-    for branch in tree.branches:
-        start = far.get(branch.start)
-        out.append(start)
-        if start is not None:
-            far.setdefault(branch.end, start + branch.length_mm)
-    return out
 
 
 def ways(tree: Tree) -> list[list[int]]:

@@ -11,6 +11,7 @@ import pytest
 from gcar_deploy.config import LesionBorders
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.output.bundle import render_files
+from gcar_deploy.tree.rooted import inlet_arcs
 from gcar_deploy.tree.tree import along
 from tests.conftest import PATIENCE_MS
 
@@ -77,6 +78,17 @@ def opaque(page, selector, places):
         context.getImageData(Math.floor(x * ratio), Math.floor(y * ratio), 1, 1).data[3] > 0);
     }"""
     return page.eval_on_selector(selector, script, places)
+
+
+def white_beside(page, selector, place):
+    """Whether something white stands right of a place, which is a share of the canvas."""
+    script = """(canvas, [x, y]) => {
+      const ratio = canvas.width / canvas.clientWidth;
+      const data = canvas.getContext("2d").getImageData(
+        x * canvas.width + 8 * ratio, y * canvas.height - 7 * ratio, 10 * ratio, 14 * ratio).data;
+      return data.some((_, i) => i % 4 === 0 && data.slice(i, i + 4).every(v => v === 255));
+    }"""
+    return page.eval_on_selector(selector, script, place)
 
 
 @pytest.mark.slow
@@ -208,8 +220,21 @@ def test_the_lesion_that_is_said_is_the_one_that_is_shaded(opened, result):
     marked = dataclasses.replace(result, options=options)
     page = opened(other=render_files(marked)["report.html"])
     (lumen,) = (one for one in marked.measured.lumens if one.lesion_mm)
-    row = page.locator(f"tbody tr[data-branch='{marked.measured.lumens.index(lumen) + 1}']")
-    row.click()
+    which = marked.measured.lumens.index(lumen)
+    (told,) = page.locator("#lesions tr").all()
+    far = (inlet_arcs(marked.tree)[which] or 0.0) + lumen.minimal_at_mm
+    cells = [f"{which + 1}", f"{far:.0f}", f"{lumen.lesion_length_mm:.1f}"]
+    assert told.locator("td").all_inner_texts()[:3] == cells
+    rows = page.locator("#branches tr")
+    assert rows.nth(which).locator("td").all_inner_texts()[7:9] == cells[1:]
+    # Its number stands beside it whatever branch is chosen; a branch without has a dash.
+    rows.nth(0 if which else 1).click()
+    assert page.locator("#branches tr.chosen td").nth(8).inner_text() == "-"
+    page.mouse.move(5, 5)
+    middle = along(branch.points_mm, branch.arc_mm, np.array([np.mean(lumen.lesion_mm)]))
+    place = (carm.project(middle)[0][0] + 0.5) / [carm.columns, carm.rows]
+    assert white_beside(page, ".lines[data-view='0']", place.tolist())
+    rows.nth(which).click()
     page.mouse.move(5, 5)
     said = page.text_content("#point")
     # Of the narrowing: the branch may taper to less elsewhere.

@@ -227,8 +227,8 @@ def test_crossings_are_the_vessels_on_the_line():
 def test_only_what_hangs_on_the_ostium_is_so_far_from_it():
     import numpy as np
 
+    from gcar_deploy.tree.rooted import inlet_arcs
     from gcar_deploy.tree.tree import Branch, Tree
-    from gcar_deploy.workbench.shown import inlet_arcs
 
     nodes = np.array([[x, 0.0, 0.0] for x in (0, 10, 30, 33, 50)])
     ends = ((0, 1), (1, 2), (3, 4))
