@@ -144,3 +144,47 @@ def test_much_to_say_leaves_the_pictures_in_sight_and_one_page_in_print(serve, b
     assert len(shown) == 7
     for a, b in itertools.combinations(shown, 2):
         assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1], (a, b)
+
+
+@pytest.mark.slow
+def test_strokes_go_with_the_frame_that_they_were_drawn_on(serve, browse):
+    """Another frame is taken only without them; the other run keeps the one drawn on."""
+    pytest.importorskip("gdcm", reason="the runs are JPEG lossless")
+    folder = of_data("phantom_xa")
+    address, cases = serve()
+    page, case, asked = browse(address), cases / "case", []
+    page.set_input_files("#files", [folder / "IM7.dcm", folder / "IM8.dcm"])
+    finished(page)
+    strips = page.locator("#frames .strip")
+    until(page, lambda: strips.count() == 2)
+    page.keyboard.press("e")
+    stroke(page, 1, [(30, 470), (60, 480)])
+    until_order(page, case, lambda order: "edits" in order)
+    drawn = order_of(case)["edits"]
+
+    answers = iter([False, True])
+
+    def answer(dialog):
+        asked.append(dialog.message)
+        dialog.accept() if next(answers) else dialog.dismiss()
+
+    def take(view, frame):
+        strips.nth(view - 1).locator("button").nth(frame - 1).click()
+
+    page.on("dialog", answer)
+    take(1, 2)
+    assert "view 1 were drawn on frame" in asked[0] and "Take frame 2" in asked[0]
+    page.wait_for_timeout(300)
+    assert order_of(case)["edits"] == drawn and "frames" not in order_of(case)
+    take(2, 3)
+    until_order(page, case, lambda order: "frames" in order)
+    own, other = order_of(case)["frames"]
+    assert f"drawn on frame {own}." in asked[0] and other == 3 and len(asked) == 1
+    assert order_of(case)["edits"] == drawn
+    until(page, lambda: "frame 3 of" in page.inner_text("#frames"))
+    take(1, 2)
+    until_order(page, case, lambda order: order["frames"] == [2, 3])
+    assert len(asked) == 2 and "edits" not in order_of(case)
+    page.click("#undo")
+    until_order(page, case, lambda order: order.get("edits") == drawn)
+    assert order_of(case)["frames"] == [own, 3]

@@ -7,9 +7,9 @@ export async function frames(store, say) {
   const runs = dicom.map((is, k) => is ? k : -1).filter(k => k >= 0);
   $("frames").hidden = !runs.length || !views.length;
   if ($("frames").hidden) return;
-  const room = $("frames").querySelector("div");
+  const room = $("frames").querySelector("div"), shown = {};
   try {
-    const strips = await Promise.all(runs.map(k => strip(store, say, k)));
+    const strips = await Promise.all(runs.map(k => strip(store, say, k, shown)));
     room.replaceChildren(...strips);
   } catch (error) { say(error.message); }
 }
@@ -28,11 +28,11 @@ function partner(store, told) {
   return now ? scores.map(row => row[now - 1]) : null;
 }
 
-async function strip(store, say, k) {
+async function strip(store, say, k, shown) {
   const path = `${store.path}/views/${k + 1}/frames`, told = await api.get(path);
   const order = store.info.order.frames;
   const asked = order && (order.length === 1 ? order[0] : order[k]);
-  const now = asked ?? told.chosen;
+  const now = shown[k] = asked ?? told.chosen;
   const with_ = partner(store, told);
   const near = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(async one => {
     near.unobserve(one.target);
@@ -44,17 +44,34 @@ async function strip(store, say, k) {
     const meter = bar("meter", filling), pair = with_ && bar("meter pair", with_[i]);
     return el("button", { type: "button", "aria-pressed": String(i + 1 === now),
       title: `Contrast ${Math.round(100 * filling)} %, motion ${Math.round(100 * told.motion[i])} % of the most${with_ ? `, with the other view's frame ${Math.round(100 * with_[i])} %` : ""}`,
-      onclick: () => choose(store, say, k, i + 1) }, picture, meter, pair, `${i + 1}${i + 1 === told.chosen ? " \u2605" : ""}`);
+      onclick: () => choose(store, say, k, i + 1, shown) }, picture, meter, pair, `${i + 1}${i + 1 === told.chosen ? " \u2605" : ""}`);
   });
   return el("div", {}, el("p", { class: "hint" }, `View ${k + 1}: frame ${now} of ${told.frames}${asked ? " (yours)" : ` (${told.reason})`}. Bar: contrast${with_ ? "; below: with the other view's frame" : ""}. \u2605: proposed.`),
     el("div", { class: "strip", tabindex: 0, role: "group", "aria-label": `Frames of view ${k + 1}` }, ...buttons));
 }
 
-async function choose(store, say, k, frame) {
-  const runs = store.info.dicom.filter(is => is).length;
-  const place = store.info.dicom.slice(0, k).filter(is => is).length;
-  const before = store.info.order.frames ?? [null];
-  const all = before.length === 1 ? Array(runs).fill(before[0]) : [...before];
-  all[place] = frame;
-  try { await store.change({ frames: all }); } catch (error) { say(error.message); }
+/** Corrections that lie in the picture of view k, and what is left without them. */
+function drawn(now, k) {
+  const without = {};
+  for (const key of ["edits", "regions"]) {
+    const { [k + 1]: own, ...others } = now[key] ?? {};
+    if (own) without[key] = others;
+  }
+  for (const key of ["landmarks", "same_branch", "ostia"]) {
+    const others = (now[key] ?? []).filter(mark => !mark[k]);
+    if (others.length < (now[key] ?? []).length) without[key] = others;
+  }
+  return without;
+}
+
+/** Take a frame. What was drawn on another one is no place in this: it goes, or the frame stays. */
+async function choose(store, say, k, frame, shown) {
+  if (frame === shown[k]) return;
+  const now = store.now, gone = drawn(now, k);
+  if (Object.keys(gone).length && !confirm(`Strokes and marks in view ${k + 1} were drawn on frame ${shown[k]}. Take frame ${frame} and discard them? Undo brings them back.`)) return;
+  const before = now.frames ?? [null], runs = store.info.dicom.map((is, view) => is ? view : -1).filter(view => view >= 0);
+  // Another run keeps the frame that was drawn on, which this choice might change.
+  const all = runs.map((view, place) => view === k ? frame
+    : (before.length === 1 ? before[0] : before[place]) ?? (Object.keys(drawn(now, view)).length ? shown[view] : null));
+  try { await store.change({ frames: all, ...gone }); } catch (error) { say(error.message); }
 }
