@@ -41,6 +41,13 @@ class Stroke:
     points: tuple[Place, ...]
     width_px: float | None = None
 
+    def meets(self, shape: tuple[int, ...]) -> bool:
+        """Whether any of it lies in a picture of (rows, cols)."""
+        if any(0 <= c <= shape[1] - 1 and 0 <= r <= shape[0] - 1 for c, r in self.points):
+            return True
+        marks = Drawn(strokes=(self,)).marks(shape)
+        return marks is not None and bool(marks[0].any() or marks[1].any())
+
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values; see ``parse_edits``."""
         width = {} if self.width_px is None else {"width_px": self.width_px}

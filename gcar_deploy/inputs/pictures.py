@@ -90,7 +90,7 @@ def prepare(
     notes += [f"view {k}: the vessel mask is the user's" for k in masks]
     for k, lines in (drawn or {}).items():
         angiograms[_index(k, "edits", angiograms)] = with_drawn(angiograms[k - 1], lines)
-        notes += [f"view {k}: {text}" for text in _said(lines)]
+        notes += [f"view {k}: {text}" for text in _said(lines, angiograms[k - 1].pixels.shape)]
     return angiograms, grid, notes
 
 
@@ -147,12 +147,15 @@ def with_drawn(angiogram: Angiogram, drawn: Drawn) -> Angiogram:
     return angiogram
 
 
-def _said(drawn: Drawn) -> list[str]:
-    count = {do: sum(one.do == do for one in drawn.strokes) for do in ("erase", "paint")}
+def _said(drawn: Drawn, shape: tuple[int, ...]) -> list[str]:
+    seen = [one for one in drawn.strokes if one.meets(shape)]
+    count = {do: sum(one.do == do for one in seen) for do in ("erase", "paint")}
     out = [
         f"{n} strokes of the user {do} vessel" if n > 1 else f"1 stroke of the user {do}s vessel"
         for do, n in count.items() if n
     ]  # fmt: skip
+    if missed := len(drawn.strokes) - len(seen):
+        out.append(f"of the user's strokes, {missed} outside the picture: without effect")
     return out + (["only the user's region of interest is looked at"] if drawn.region else [])
 
 

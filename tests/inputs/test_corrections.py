@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from gcar_deploy.config import RunOptions
 from gcar_deploy.data.demo_case import demo_case
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.inputs.drawn import Drawn, Stroke
 from gcar_deploy.inputs.order import Order, parse_order
+from gcar_deploy.inputs.pictures import prepare
 
 SQUARE = ((10.0, 10.0), (20.0, 10.0), (20.0, 20.0), (10.0, 20.0))
 
@@ -36,6 +38,18 @@ def test_a_dot_and_a_region():
     assert erased[9, 8] and 9 <= erased.sum() <= 40
     inside = Drawn(region=SQUARE).inside((50, 60))
     assert inside.sum() == 121 and inside[10, 20] and Drawn().inside((5, 5)) is None
+
+
+def test_a_stroke_outside_the_picture_is_told():
+    """One whose points lie outside may still cross the picture."""
+    case = demo_case()
+    lines = [[[900, 900], [950, 900]], [[-90, 100], [900, 100]], [[30, 30], [40, 30]]]
+    drawn = Drawn(strokes=tuple(
+        Stroke(do="erase", points=tuple(map(tuple, line)), width_px=4) for line in lines
+    ))  # fmt: skip
+    _, _, notes = prepare(case.pictures, case.geometry, RunOptions(), drawn={1: drawn})
+    assert "view 1: 2 strokes of the user erase vessel" in notes
+    assert "view 1: of the user's strokes, 1 outside the picture: without effect" in notes
 
 
 @pytest.fixture(scope="module")

@@ -99,6 +99,7 @@ def way_of_a_case(page, case, strokes, marks):
     assert np.linalg.norm(np.array(pair[1]) - marks[1]) < 24
     page.click("#run")
     finished(page)
+    assert page.locator("#status .older").count() == 0
     page.click("#status .notes summary")
     assert "1 stroke of the user erases vessel" in page.inner_text("#status")
     corrected, rows = files_of(case / "result"), page.locator("#lesions tbody tr")
@@ -235,8 +236,10 @@ def test_tools_write_what_they_say(serve, browse):
     page.click("[data-tool=paint]")
     page.locator(".view canvas").first.focus()
     page.keyboard.press("ArrowRight")
+    assert page.locator("#status .older").count() == 0
     page.keyboard.press("Enter")
     until_order(page, case, lambda o: "edits" in o)
+    assert "older than the corrections" in page.inner_text("#status .older")
     assert order_of(case)["edits"]["1"][0]["points"][0] == [261, 256]
     page.click("[data-tool=region]")
     for place in ((30, 90), (480, 90), (480, 480), (30, 480)):

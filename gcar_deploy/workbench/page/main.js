@@ -125,7 +125,7 @@ const erase = branch => attempt(async () => {
 store.addEventListener("opened", () => { lay(true); buttons(); status(store); corrections(store, say); $("lumen").hidden = true; $("files-of").hidden = true; $("alternatives").hidden = true; });
 store.addEventListener("pictures", () => lay());
 store.addEventListener("changed", () => {
-  buttons(); corrections(store, say); draw();
+  buttons(); status(store); corrections(store, say); draw();
   if (store.info.problem) ask();
 });
 store.addEventListener("progress", () => {
