@@ -31,7 +31,8 @@ def frames(runs: tuple[Path, Path], order: Order, talk: Talk) -> None:
     filled with contrast and fairly still, every pair is scored by how alike the contrast is spread
     over the epipolar planes, frames before and after included; no ECG is needed, but R waves
     that both files name go first. The margin says how far the pair is ahead of the best one in
-    which either run shows another shape of the heart. gcar run --frame auto takes this pair.
+    which either run shows another shape of the heart. gcar run takes this pair; where hardly
+    anything moves, as in a phantom, its own choice for each run is told instead.
 
     With --out DIR: frames.png (scores of all pairs, the chosen frames beside them), frames.json,
     frame_view1.png, frame_view2.png.
@@ -103,15 +104,14 @@ def _lines(told: dict[str, Any]) -> list[str]:
         out.append(f"{i + 1:5d}  {j + 1:5d}  {score:5.2f}  {a:4.0%} {b:4.0%}   {x:4.0%} {y:4.0%}")
     first, second = told["frames"]
     margin = told["margin"]
-    out.append(
-        f"frames {first} and {second}: score {told['score']:.2f}, "
-        + ("no other phase to compare with" if margin is None else f"margin {margin:.3f}")
-    )
-    for number, moves in enumerate(told["moves"], start=1):
-        if not moves:
-            out.append(
-                f"run {number}: hardly anything moves, so that its frames are alike; gcar run "
-                "chooses them each by itself"
-            )
+    out += [
+        f"run {number}: hardly anything moves: no pair is better than another"
+        for number, moves in enumerate(told["moves"], start=1) if not moves
+    ]  # fmt: skip
+    if not all(told["moves"]):
+        how = "each chosen by itself"
+    else:
+        how = "no other phase to compare with" if margin is None else f"margin {margin:.3f}"
+    out.append(f"frames {first} and {second}: score {told['score']:.2f}, {how}")
     out.append(f"gcar run ... --frame {first},{second}")
     return out

@@ -14,7 +14,14 @@ from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import intensity_of, wanted_frames
 from gcar_deploy.errors import CancelledError, GcarError, GeometryError, UsageError
 from gcar_deploy.frames.bare import bare_before
-from gcar_deploy.frames.choose import SeenRun, choose_frames, masses_of, pair_of, stands_still
+from gcar_deploy.frames.choose import (
+    LEAST_FRAMES,
+    SeenRun,
+    choose_frames,
+    masses_of,
+    pair_of,
+    stands_still,
+)
 from gcar_deploy.frames.cine import Cine, is_cine, open_cine
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity, Scene, match_picture
@@ -149,6 +156,11 @@ def compared(
 ) -> tuple[FramePair, tuple[SeenRun, SeenRun], dict[str, bool]]:  # fmt: skip
     """Hold the frames of two runs against each other, whether they beat or not.
 
+    Returns
+    -------
+    the pair that ``together`` takes, or, where it takes none, the frames that the runs choose each
+    by itself (without a margin); the runs; number of the view -> whether it shows a heartbeat
+
     Raises
     ------
     UsageError
@@ -168,7 +180,17 @@ def compared(
             raise UsageError(f"{run.cine.name}: nothing in it moves, and no contrast arrives")
     wanted = runs.wanted[1], runs.wanted[2]
     pair = pair_of(first, second, a, b, wanted)
-    return pair, (first, second), {"1": a.beats, "2": b.beats}
+    beats = {
+        str(k): masses.beats and len(run.cine) >= LEAST_FRAMES
+        for k, (run, masses) in enumerate(((first, a), (second, b)), start=1)
+    }
+    if not all(beats.values()):
+        i, j = (
+            choose_frame(run.cine, frame, run.cine.name, run.intensity).index
+            for run, frame in zip((first, second), wanted, strict=True)
+        )
+        pair = dataclasses.replace(pair, chosen=(i, j), margin=None)
+    return pair, (first, second), beats
 
 
 def _needed(k: int, runs: Runs, scene: Scene | None, options: RunOptions) -> SeenRun:

@@ -53,6 +53,17 @@ def test_runs_without_spacing_ask_for_it(folder, name):
     assert angiograms[0].carm.pixel_spacing_mm == angiograms[1].carm.pixel_spacing_mm
 
 
+@pytest.mark.slow
+def test_frames_of_a_phantom_are_those_that_a_run_takes(folder):
+    """Nothing moves, so that no pair is better: not the one of the highest score is proposed."""
+    paths = [folder / "IM7.dcm", folder / "IM8.dcm"]
+    own = [read_run(path, DicomOptions()).index + 1 for path in paths]
+    told = gcar("frames", *paths)
+    assert told.code == 0, told.err
+    assert told.out.count("no pair is better than another") == 2 and "margin" not in told.out
+    assert told.out.splitlines()[-1] == f"gcar run ... --frame {own[0]},{own[1]}"
+
+
 def test_the_command_asks_as_well(folder, tmp_path):
     asked = gcar("run", folder / "IM1.dcm", folder / "IM7.dcm", "--out", tmp_path / "r")
     assert asked.code == 4 and "--pixel-spacing" in asked.err.splitlines()[-1]
