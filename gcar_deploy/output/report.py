@@ -8,6 +8,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from importlib import resources
 from typing import Any
 
@@ -280,6 +281,8 @@ def _facts(summary: Mapping[str, Any]) -> str:
         "expected in ghosts": _share(summary["ambiguity"]["ghost_share"]),
         "Gaussians": str(summary["counts"]["gaussians"]),
         "time": f"{summary['seconds']['total']:.1f} s",
+        # Here alone: the other files of one input are the same on every day.
+        "written": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"),
     }
     return "".join(
         f"<span>{html.escape(name)} <b>{html.escape(value)}</b></span>"

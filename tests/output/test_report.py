@@ -7,10 +7,12 @@ import hashlib
 import html.parser
 import json
 import re
+from datetime import datetime
 
 import numpy as np
 import pytest
 
+from gcar_deploy.output.bundle import render_files
 from gcar_deploy.output.report import _embedded, report_html
 from gcar_deploy.output.words import LEFT_OUT
 
@@ -55,6 +57,14 @@ def test_status_comes_first(text, result):
     body = text.split("<body>")[1]
     visible = re.sub(r"<[^>]+>", " ", body).split()
     assert visible[0] == result.status
+
+
+def test_the_day_is_told_and_no_other_file_changes_with_it(result, files, text):
+    told = re.search(r"written <b>(\d{4}-\d\d-\d\d \d\d:\d\d [+-]\d{4})</b>", text).group(1)
+    age = datetime.now().astimezone() - datetime.strptime(told, "%Y-%m-%d %H:%M %z")
+    assert 0 <= age.total_seconds() < 3600
+    again = render_files(result)
+    assert [name for name in files if files[name] != again[name]] in ([], ["report.html"])
 
 
 @pytest.mark.req("REQ-38")

@@ -118,6 +118,12 @@ def test_dragging_turns_the_c_arm(opened):
     assert angle(page) == "LAO 45 CRA 90"
 
 
+def test_the_folder_is_told_where_the_page_lies(opened, tmp_path):
+    page = opened()
+    assert f"folder {tmp_path.parent.name}/{tmp_path.name}" in page.inner_text(".facts")
+    assert tmp_path.name not in (tmp_path / "report.html").read_text()
+
+
 def test_signs_of_a_drag_by_the_geometry():
     """A point on the detector's side moves right and down when the angles change like that."""
 
