@@ -14,6 +14,7 @@ from gcar_deploy.output.bundle import render_files
 from gcar_deploy.tree.rooted import inlet_arcs
 from gcar_deploy.tree.tree import along
 from tests.conftest import PATIENCE_MS
+from tests.workbench.conftest import lightness, nothing_serious
 
 #: where a lesion is marked on a branch, shares of its length
 EIGHTHS = np.array([3, 5]) / 8
@@ -25,10 +26,13 @@ def opened(chromium, files, tmp_path):
     path = tmp_path / "report.html"
     complaints, contexts = [], []
 
-    def open_page(width=1280, touch=False, other=None):
+    def open_page(width=1280, touch=False, other=None, scheme="light"):
         path.write_bytes(files["report.html"] if other is None else other)
         context = chromium.new_context(
-            viewport={"width": width, "height": 1000}, has_touch=touch, is_mobile=touch
+            viewport={"width": width, "height": 1000},
+            has_touch=touch,
+            is_mobile=touch,
+            color_scheme=scheme,
         )
         context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
@@ -304,6 +308,19 @@ def test_fingers_on_a_tablet(opened):
     for kind, points in (("touchStart", [start]), ("touchMove", [stop]), ("touchEnd", [])):
         session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     assert angle(page) == "RAO 40 CRA 0"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_dark_rooms_get_a_dark_page_and_paper_a_light_one(opened, scheme):
+    page = opened(scheme=scheme)
+    nothing_serious(page)
+    assert (lightness(page, "body") < 40) == (lightness(page, ".panel") < 40) == (scheme == "dark")
+    letters = (227, 232, 239) if scheme == "dark" else (28, 36, 48)
+    assert letters in colors(page, "#curve")
+    page.emulate_media(media="print", color_scheme=scheme)
+    assert lightness(page, ".panel") == 255 and lightness(page, "body") > 240
+    assert (28, 36, 48) in colors(page, "#curve")
 
 
 @pytest.mark.slow

@@ -63,9 +63,9 @@ def browse(chromium):
     """Call with an address and a width; at the end the console must be silent, no call foreign."""
     complaints, contexts = [], []
 
-    def open_page(address: str, width: int = 1280, height: int = 900):
+    def open_page(address: str, width: int = 1280, height: int = 900, scheme: str = "light"):
         context = chromium.new_context(
-            viewport={"width": width, "height": height}, accept_downloads=True
+            viewport={"width": width, "height": height}, accept_downloads=True, color_scheme=scheme
         )
         context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
@@ -124,6 +124,12 @@ def nothing_serious(page):
     bad = [v for v in found["violations"] if v["impact"] in ("serious", "critical")]
     told = [(v["id"], [node["html"][:120] for node in v["nodes"]][:3]) for v in bad]
     assert found["passes"] and not told, told
+
+
+def lightness(page, selector) -> float:
+    """Of an element's background, 0 (black) .. 255."""
+    told = page.eval_on_selector(selector, "e => getComputedStyle(e).backgroundColor")
+    return sum(map(int, told[4:-1].split(","))) / 3
 
 
 def until(page, holds):

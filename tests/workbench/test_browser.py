@@ -20,6 +20,7 @@ from tests.conftest import of_data, ready_case
 from tests.workbench.conftest import (
     click,
     finished,
+    lightness,
     nothing_serious,
     order_of,
     stroke,
@@ -309,16 +310,21 @@ def test_a_long_scribble_is_kept_whole_and_tabs_do_not_wipe_each_other(serve, br
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width", [1280, 820, 390])
-def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width):
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(1280, "light"), (820, "light"), (390, "light"), (1280, "dark")]
+)
+def test_nothing_is_cut_off_and_axe_finds_nothing_serious(serve, browse, width, scheme):
     address, _ = serve(lambda desk: desk.demo().id)
-    page = browse(address, width)
+    page = browse(address, width, scheme=scheme)
     finished(page)
     page.wait_for_timeout(300)
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     page.click("#geometry summary")
     page.click("#files-of summary")
     nothing_serious(page)
+    assert (lightness(page, "body") < 40) == (lightness(page, ".panel") < 40) == (scheme == "dark")
+    page.emulate_media(media="print", color_scheme=scheme)
+    assert lightness(page, "body") == lightness(page, ".panel") == 255
 
 
 @pytest.mark.slow

@@ -14,6 +14,9 @@ export function el(name, attributes = {}, ...children) {
   return made;
 }
 
+/** A colour of the page as it is now: light, dark or on paper. */
+export const tone = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+
 /** Context of a canvas in CSS pixels, sharp on any screen, with its width and height. */
 export function pen(canvas) {
   const ratio = window.devicePixelRatio || 1;

@@ -144,11 +144,11 @@ function dial(degrees, y, words, body) {
   const [dx, dy] = at(degrees, 44), [sx, sy] = at(degrees + 180, 50);
   const turned = `rotate(${degrees})`;
   return svg("g", { transform: `translate(66 ${y})` },
-    svg("circle", { r: 50, fill: "none", stroke: "#cfd6e0" }), body,
-    svg("path", { d: `M ${sx} ${sy} L ${dx} ${dy}`, stroke: "#0b5cad", "stroke-width": 2 }),
-    svg("rect", { x: -18, y: -48, width: 36, height: 9, rx: 2, fill: "#1a2230", transform: turned }),
-    svg("circle", { cx: sx, cy: sy, r: 6, fill: "#e69f00", stroke: "#1a2230" }),
-    ...words.map(([text, x, ty]) => { const t = svg("text", { x, y: ty, "font-size": 10, "text-anchor": "middle", fill: "#525c6b" }); t.textContent = text; return t; }));
+    svg("circle", { r: 50, fill: "none", stroke: "var(--line)" }), body,
+    svg("path", { d: `M ${sx} ${sy} L ${dx} ${dy}`, stroke: "var(--link)", "stroke-width": 2 }),
+    svg("rect", { x: -18, y: -48, width: 36, height: 9, rx: 2, fill: "var(--ink)", transform: turned }),
+    svg("circle", { cx: sx, cy: sy, r: 6, fill: "#e69f00", stroke: "var(--ink)" }),
+    ...words.map(([text, x, ty]) => { const t = svg("text", { x, y: ty, "font-size": 10, "text-anchor": "middle", fill: "var(--soft)" }); t.textContent = text; return t; }));
 }
 
 function drawing(view) {

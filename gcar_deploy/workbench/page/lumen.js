@@ -1,5 +1,5 @@
 // The table of narrowings, and the diameter along a vessel from the ostium to its tip.
-import { $, el, inside, nameOf, pen, ring } from "./dom.js";
+import { $, el, inside, nameOf, pen, ring, tone } from "./dom.js";
 
 const fixed = (value, digits) => value === null || value === undefined ? "\u2013" : value.toFixed(digits);
 const COLUMNS = [
@@ -118,30 +118,30 @@ export class Curve {
     for (const { branch, start } of parts) {
       for (const lesion of branch.lesion ? [branch.lesion, ...branch.further] : []) {
         const [begin, end] = lesion.map(s => x(start + s));
-        ctx.fillStyle = "#d55e0033"; ctx.fillRect(begin, top, Math.max(3, end - begin), bottom - top);
+        ctx.fillStyle = tone("lesion"); ctx.fillRect(begin, top, Math.max(3, end - begin), bottom - top);
       }
-      ctx.strokeStyle = "#525c6b"; ctx.lineWidth = 1.5; ctx.setLineDash([5, 4]); ctx.beginPath();
+      ctx.strokeStyle = tone("soft"); ctx.lineWidth = 1.5; ctx.setLineDash([5, 4]); ctx.beginPath();
       let down = false;
       branch.arc.forEach((s, i) => { const r = branch.reference[i]; if (r !== null) { ctx[down ? "lineTo" : "moveTo"](x(start + s), y(2 * r)); down = true; } });
       ctx.stroke(); ctx.setLineDash([]);
-      ctx.strokeStyle = "#0b5cad"; ctx.lineWidth = branch.branch === this.store.chosen ? 3.2 : 1.8; ctx.beginPath();
+      ctx.strokeStyle = tone("link"); ctx.lineWidth = branch.branch === this.store.chosen ? 3.2 : 1.8; ctx.beginPath();
       branch.arc.forEach((s, i) => ctx[i ? "lineTo" : "moveTo"](x(start + s), y(2 * branch.radius[i])));
       ctx.stroke();
-      if (start > 0) { ctx.strokeStyle = "#cfd6e0"; ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(start), top); ctx.lineTo(x(start), bottom); ctx.stroke(); }
-      ctx.fillStyle = "#1a2230"; ctx.font = "600 12px system-ui, sans-serif"; ctx.textAlign = "center";
+      if (start > 0) { ctx.strokeStyle = tone("line"); ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(start), top); ctx.lineTo(x(start), bottom); ctx.stroke(); }
+      ctx.fillStyle = tone("ink"); ctx.font = "600 12px system-ui, sans-serif"; ctx.textAlign = "center";
       ctx.fillText(nameOf(branch), x(start + branch.arc.at(-1) / 2), 12);
       if (branch.least) ring(ctx, x(start + branch.least[0]), y(branch.least[1]), 4, "#d55e00", "#fff");
     }
     const { cursor } = this.store, part = cursor && parts.find(p => p.branch.branch === cursor.branch);
     if (part) {
       const s = part.start + part.branch.arc[cursor.at];
-      ctx.strokeStyle = "#8a6d00"; ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(s), top); ctx.lineTo(x(s), bottom); ctx.stroke();
+      ctx.strokeStyle = tone("pair"); ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(s), top); ctx.lineTo(x(s), bottom); ctx.stroke();
       ring(ctx, x(s), y(2 * part.branch.radius[cursor.at]), 5, "#ffe14d", "#1a2230");
     }
     $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: gravest narrowing; shaded: lesion.";
   }
   axes(ctx, { from, left, right, top, bottom, most, length, x, y }) {
-    ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = "#525c6b"; ctx.strokeStyle = "#e3e8ee"; ctx.lineWidth = 1;
+    ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = tone("soft"); ctx.strokeStyle = tone("line"); ctx.lineWidth = 1;
     ctx.textAlign = "right"; ctx.textBaseline = "middle";
     for (let w = 0; w <= most; w += most > 5 ? 2 : 1) {
       ctx.beginPath(); ctx.moveTo(left, y(w)); ctx.lineTo(right, y(w)); ctx.stroke(); ctx.fillText(String(w), left - 6, y(w));

@@ -171,7 +171,7 @@ window.addEventListener("beforeprint", () => {
   draw();
 });
 window.addEventListener("afterprint", () => closed.forEach(list => { list.open = false; }));
-window.matchMedia("print").addEventListener("change", draw);
+for (const kind of ["print", "(prefers-color-scheme: dark)"]) window.matchMedia(kind).addEventListener("change", draw);
 
 window.addEventListener("keydown", e => {
   if ($("case").hidden || e.target.matches("input, select")) return;
