@@ -12,9 +12,10 @@ export function status(store) {
   const facts = [["views apart", `${summary.separation_deg.toFixed(0)}\u00b0`], ["branches", summary.tree.branches.length],
     ["centreline", `${summary.tree.length_mm.toFixed(0)} mm`], ["time", `${summary.seconds.total.toFixed(1)} s`]];
   const list = (name, lines, kind) => lines.length ? el("details", { class: kind }, el("summary", {}, `${name} (${lines.length})`), el("ul", {}, ...lines.map(text => el("li", {}, store.words(text))))) : null;
-  const older = store.stale ? [el("p", { class: "older" }, "This result is older than the corrections: Reconstruct shows what they change.")] : [];
-  box.replaceChildren(el("b", {}, word), summary.sentence, ...older,
-    el("div", { class: "facts" }, ...facts.map(([name, value]) => el("span", {}, `${name} `, el("b", {}, String(value)))),
+  // In a row that is there already: the pictures must not move under a stroke.
+  const older = store.stale ? el("span", { class: "older" }, "older than the corrections: Reconstruct") : null;
+  box.replaceChildren(el("b", {}, word), summary.sentence,
+    el("div", { class: "facts" }, older, ...facts.map(([name, value]) => el("span", {}, `${name} `, el("b", {}, String(value)))),
       list("Findings", findings, "said"), list("Notes", summary.notes, "notes"), list("What no picture can show", summary.silent_errors, "silent")));
 }
 
