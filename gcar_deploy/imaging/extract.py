@@ -19,6 +19,7 @@ from gcar_deploy.imaging.border import cut_out, put_back, shown_box
 from gcar_deploy.imaging.coarse import as_fine, coarser
 from gcar_deploy.imaging.collimator import collimator
 from gcar_deploy.imaging.edits import edited
+from gcar_deploy.imaging.full_mask import refuse_full
 from gcar_deploy.imaging.fusion import fused, without_device
 from gcar_deploy.imaging.learned import Found, learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
@@ -233,11 +234,11 @@ def _from_mask(angiogram: Angiogram) -> VesselImage:
     """Chords of round vessels: no brightness is read."""
     _refuse_dark(angiogram)
     valid = np.ones(angiogram.pixels.shape, bool) if angiogram.valid is None else angiogram.valid
-    mask = above_half(angiogram.pixels) & valid
+    above = above_half(angiogram.pixels)
+    refuse_full(angiogram, above)
+    mask = above & valid
     if angiogram.mask is not None:
         mask &= angiogram.mask
-    if mask.mean() > _FULL:
-        raise _nothing(angiogram, "nearly every pixel is full")
     refuse_thin(angiogram, mask)
     return _from_drawn(dataclasses.replace(angiogram, valid=valid), mask)
 

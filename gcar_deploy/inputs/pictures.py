@@ -21,6 +21,7 @@ from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half
+from gcar_deploy.imaging.full_mask import MOST_VESSEL
 from gcar_deploy.imaging.read import from_zero, read_picture
 from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.runs import find_runs, seen_runs, together, with_bare
@@ -192,8 +193,11 @@ def with_masks(
                 f"mask {number} has {array.shape} (rows, columns), its picture {shape}"
             )
         mask = above_half(array)
-        if not mask.any() or mask.mean() > 0.9:
-            raise ImageError(f"mask {number} marks {mask.mean():.0%} of the picture as vessel")
+        if not mask.any() or mask.mean() > MOST_VESSEL:
+            raise ImageError(
+                f"mask {number} marks {mask.mean():.0%} of the picture as vessel "
+                f"(at most {MOST_VESSEL:.0%} can be)"
+            )
         out[place] = dataclasses.replace(out[place], mask=mask)
     return out
 

@@ -217,7 +217,7 @@ CASES: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "constant view": (picture(lambda p: np.full_like(p, 500)), 6, "view 2 (view2.png)"),
     "saturated view": (picture(lambda p: np.maximum(p, 60000)), 6, "no vessel"),
     "empty mask": (mask(np.zeros_like), 6, "no vessel"),
-    "full mask": (mask(nearly_full), 6, "(view2.png): nearly every pixel"),
+    "full mask": (mask(nearly_full), 6, "(view2.png): intensity.kind is mask, but "),
     "mask of one pixel": (mask(speckle), 6, "mm of line"),
     "both views blank": (both_blank, 6, "no vessel found in view 1 (view1.png)"),
     "both views the same picture": (same_picture, 6, "same picture"),

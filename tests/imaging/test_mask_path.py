@@ -84,6 +84,18 @@ def test_a_thinned_mask_is_refused(kind: str, corners: bool) -> None:
     assert view(thin, pixel_mm=1.0).mask.any()
 
 
+def test_an_x_ray_picture_and_an_inverted_mask_are_no_masks() -> None:
+    whole = tube_paths() > 0.5
+    bright = raw_picture(tube_paths())
+    # A third as bright but for one spot: little is above half, yet nearly all is grey.
+    faint = np.where(np.arange(bright.size).reshape(bright.shape) == 0, 3 * bright.max(), bright)
+    soft = cv2.GaussianBlur(whole.astype(np.float32), (0, 0), 2.0)
+    for pixels, told in ((bright, "above half"), (~whole, "above half"), (faint, "neither")):
+        with pytest.raises(RefusedError, match=f"view 2: intensity.kind is mask, but .*% .*{told}"):
+            extract_vessels(angiogram(pixels, "mask"), ImagingOptions())
+    assert extract_vessels(angiogram(soft, "mask"), ImagingOptions()).mask.any()
+
+
 def test_an_empty_mask_has_no_path() -> None:
     assert not mask_path(np.zeros((20, 30), bool), 0.3).any()
 
