@@ -133,17 +133,22 @@ def default_grid(carms: list[CArm]) -> Grid:
     It bounds the volume alone, not where vessels are looked for (``Grid.bounds``).
     """
     radius = DEFAULT_EDGE_MM / 2
-    for carm in carms:
+    for nth, carm in enumerate(carms, start=1):
         c0, r0 = carm.principal_point
         f_col, f_row = carm.focal_px
         half = min(
             (min(c0, carm.columns - 1 - c0) + 0.5) / f_col,
             (min(r0, carm.rows - 1 - r0) + 0.5) / f_row,
         )
-        if half <= 0:
-            raise GeometryError("principal_point_px lies outside the picture; give a volume")
         # The cone's edge touches a sphere of SOD sin(half angle) round the isocentre.
-        radius = min(radius, carm.sod_mm * math.sin(math.atan(half)))
+        seen = carm.sod_mm * math.sin(math.atan(half))
+        if seen < 0.5:  # of a volume each edge is 1 mm or more
+            raise GeometryError(
+                f"view {nth} sees no space round the isocentre: its principal point "
+                f"({c0:g}, {r0:g}) is at the edge of or outside the picture of {carm.columns} x "
+                f"{carm.rows} pixels; correct principal_point_px, or give a volume"
+            )
+        radius = min(radius, seen)
     edge = 2 * radius
     return Grid(
         center_mm=(0.0, 0.0, 0.0), size_mm=(edge,) * 3, shape=(DEFAULT_SHAPE,) * 3, bounds=False

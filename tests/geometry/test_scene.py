@@ -194,6 +194,16 @@ def test_matrix_alone_is_enough():
     assert other.intensity == Intensity(kind="raw")
 
 
+@pytest.mark.parametrize("point", [[0, 0], [511, 255], [-40, 255]])
+def test_a_principal_point_at_the_edge_is_named_where_no_volume_is_given(point):
+    """Not a key that the file does not hold."""
+    scene = changed((*FIRST, "principal_point_px"), point)
+    assert parse_scene(json.dumps(scene)).volume_grid().size_mm[0] > 1
+    scene["volume"] = None
+    with pytest.raises(GeometryError, match=r"view 1 sees no space .* correct principal_point_px"):
+        parse_scene(json.dumps(scene))
+
+
 def matrix_view(**more):
     carm = parse_scene(json.dumps(SCENE)).views[0].carm
     own = {"rows": 512, "columns": 512, "projection_matrix": carm.world2pixel.tolist(), **more}
@@ -289,7 +299,7 @@ BEYOND_SCHEMA = (
     "disagrees with",
     "mm_per_count is missing",
     "at odds with a lone",
-    "lies outside the picture",
+    "sees no space round the isocentre",
     "2^28",
 )
 
