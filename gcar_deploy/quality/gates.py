@@ -53,6 +53,7 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
         raise RefusedError(
             f"views are {angle:.1f} deg apart (folded to 0 .. 90); at least "
             f"{options.min_separation_deg:g} deg are needed to see depth"
+            + _in_radians([angiogram.carm for angiogram in angiograms], options)
         )
     findings = _frame_findings(angiograms, options)
     if angle < options.good_separation_deg:
@@ -61,6 +62,16 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
             f"{options.good_separation_deg:g} deg"
         )
     return findings
+
+
+def _in_radians(carms: Sequence[CArm], options: QualityOptions) -> str:
+    """Return a question where the angles, taken as radians, would set the views apart."""
+    angles = np.array([(carm.primary_angle_deg, carm.secondary_angle_deg) for carm in carms])
+    apart = np.degrees(np.ptp(angles, axis=0).max())
+    if np.abs(angles).max() > np.pi or apart < options.min_separation_deg:
+        return ""
+    told = " and ".join(f"{primary:g}" for primary in angles[:2, 0])
+    return f" (are the angles in radians? primary_angle_deg is {told}; degrees are asked for)"
 
 
 def _frame_findings(angiograms: Sequence[Angiogram], options: QualityOptions) -> list[str]:

@@ -55,6 +55,18 @@ def test_separation(case, second, outcome):
         assert bool(check_views(pair, OPTIONS)) == (outcome == "degraded")
 
 
+@pytest.mark.parametrize(
+    ("primary", "asked"),
+    [((np.radians(-25), np.radians(42)), True), ((0.0, np.pi / 2), True), ((0.0, 0.0), False),
+     ((2.0, 2.01), False), ((-30.0, -28.0), False), ((0.0, 178.0), False)],
+)  # fmt: skip
+def test_angles_in_radians_are_asked_about(case, primary, asked):
+    pair = [turned(one, angle) for one, angle in zip(case[0], primary, strict=True)]
+    with pytest.raises(RefusedError, match="to see depth") as refused:
+        check_views(pair, OPTIONS)
+    assert ("are the angles in radians?" in str(refused.value)) == asked
+
+
 def test_one_good_pair_among_many_views_is_enough(case):
     first, second = case[0]
     views = [turned(first, 0.0), turned(first, 1.0), turned(second, 60.0)]
