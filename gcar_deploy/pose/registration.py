@@ -123,7 +123,8 @@ def register(
         ids = views[one.partner].view_id, views[one.view].view_id
         turn = one.turn_deg, one.turned, one.turn_gain
         scale = one.scale, one.scaled, one.scale_gain
-        findings += check_asked(ids, one.given, turn, scale, options.quality)
+        lone = one.uncovered_mm
+        findings += check_asked(ids, one.given, turn, scale, options.quality, lone)
     moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
     findings += check_poses(views, moves, options.quality)
     findings += _unfinished(views, poses) + _marked_apart(views, poses)

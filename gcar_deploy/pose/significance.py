@@ -57,6 +57,7 @@ class Asked:
     given : disagreement after the best shift alone, 0 .. 1
     turned, scaled : the same with turn or scale as well
     turn_gain, scale_gain : how many times more the squared difference is without them
+    uncovered_mm : length across the epipolar planes that one view alone shows vessel on, mm
     """
 
     view: int
@@ -68,6 +69,7 @@ class Asked:
     scaled: float
     turn_gain: float
     scale_gain: float
+    uncovered_mm: float
 
 
 def asked(
@@ -201,4 +203,5 @@ def _asked(view: int, partner: int, pair: Pair) -> Asked:
         view=view, partner=partner, turn_deg=float(np.abs(turn[1:3]).max()),
         scale=float(np.exp(scale[3])), given=given[1], turned=turned[1], scaled=scaled[1],
         turn_gain=given[0] / max(turned[0], 1e-12), scale_gain=given[0] / max(scaled[0], 1e-12),
+        uncovered_mm=told,
     )  # fmt: skip

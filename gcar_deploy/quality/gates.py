@@ -25,6 +25,9 @@ from gcar_deploy.types import Scalars
 CUT_SHIFT_MM = 1.0
 #: a model that is nowhere as confident as this finds no vessel, whatever the pictures show
 LEAST_FOUND = 0.5
+#: so much vessel that one view alone shows may be missing in the other, mm across the planes of the
+#: beams. A distance that is 5 % wrong leaves up to 4, one tree half as dense 8
+MISSING_MM = 10.0
 #: disagreement along the epipolar lines, for those who never heard of them
 NO_MATCH = "no match where the beams of both views meet"
 
@@ -279,7 +282,7 @@ def is_cut(view: VesselImage) -> bool:
 
 def check_asked(
     view_ids: tuple[str, str], given: float, turn: tuple[float, float, float],
-    scale: tuple[float, float, float], options: QualityOptions,
+    scale: tuple[float, float, float], options: QualityOptions, uncovered_mm: float = 0.0,
 ) -> list[str]:  # fmt: skip
     """Judge whether the pictures ask for another angle or scale of the second view.
 
@@ -290,6 +293,7 @@ def check_asked(
     turn : correction in deg, disagreement with it, and how many times more the squared difference
         is without it
     scale : the same with the factor that the view's pixels are too small by
+    uncovered_mm : length across the planes of the beams that one view alone shows vessel on, mm
     """
 
     def significant(after: float, gain: float) -> bool:
@@ -299,17 +303,25 @@ def check_asked(
     by_turn = significant(*turn[1:]) and turn[0] > options.good_turn_deg
     by_scale = significant(*scale[1:]) and abs(np.log(scale[0])) > options.good_scale
     first, second = view_ids
+    # Vessel that is missing at one end of a view looks like pixels that are too small.
+    missing = (
+        ", or are vessels of one view not filled or cut off (one alone shows vessel on "
+        f"{uncovered_mm:.0f} mm across the planes of the beams)"
+        if uncovered_mm >= MISSING_MM
+        else ""
+    )
     if by_scale and (not by_turn or scale[1] <= turn[1]):
         return [
             f"view {second} would agree better with view {first} if its pixels were "
             f"{abs(scale[0] - 1):.0%} {'larger' if scale[0] > 1 else 'smaller'} ({scale[1]:.0%} of "
-            f"the vessels differ, not {given:.0%}): is its pixel spacing, SDD or SOD wrong?"
+            f"the vessels differ, not {given:.0%}): is its pixel spacing, SDD or SOD wrong"
+            f"{missing}?"
         ]
     if by_turn:
         return [
             f"view {second} would agree better with view {first} if it were turned by "
             f"{turn[0]:.1f} deg ({turn[1]:.0%} of the vessels differ, not {given:.0%}): is an "
-            "angle of either wrong?"
+            f"angle of either wrong{missing}?"
         ]
     return []
 

@@ -37,7 +37,8 @@ def findings(views):
     (one,) = asked(views, poses_between(views, OPTIONS), OPTIONS)
     turn = one.turn_deg, one.turned, one.turn_gain
     scale = one.scale, one.scaled, one.scale_gain
-    return one, check_asked(("1", "2"), one.given, turn, scale, OPTIONS.quality)
+    quality = OPTIONS.quality
+    return one, check_asked(("1", "2"), one.given, turn, scale, quality, one.uncovered_mm)
 
 
 def test_right_views_ask_for_nothing():
@@ -60,6 +61,17 @@ def test_a_wrong_scale_of_one_view_is_asked_for_with_its_factor(factor):
     one, (said,) = findings(told(views, pixel_spacing_mm=spacing))
     assert one.scale == pytest.approx(1 / factor, abs=0.02)
     assert "spacing, SDD or SOD" in said and ("smaller" if factor > 1 else "larger") in said
+    assert "not filled" not in said
+
+
+def test_vessel_that_is_not_filled_is_named_beside_a_scale_that_it_looks_like():
+    first, second = spoilt()
+    shown = np.arange(second.carm.rows)[:, None] < np.median(np.nonzero(second.path_mm)[0])
+    half = {name: getattr(second, name) * shown for name in ("path_mm", "mask", "skeleton")}
+    views = [first, dataclasses.replace(second, **half)]
+    placed = register(pair()[0], views, OPTIONS, lambda _: pytest.fail("two views need no tree"))
+    said = next(text for text in placed.findings if "pixels were" in text)
+    assert "SDD or SOD wrong, or are vessels of one view not filled or cut off" in said
 
 
 @pytest.mark.parametrize(
