@@ -15,6 +15,8 @@ import numpy as np
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.errors import RefusedError
 from gcar_deploy.geometry.carm import CArm, separation_deg
+from gcar_deploy.geometry.consistency import uncovered_mm as uncovered
+from gcar_deploy.geometry.consistency import vessel_mass
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.quality.duplicates import check_duplicates
@@ -134,22 +136,32 @@ def check_consistency(
         kind = kind_of((other, view))
         ids = other.view_id, view.view_id
         cut = [seen.view_id for seen in (other, view) if is_cut(seen)]
-        findings += check_agreement(ids, value, kind, options, cut)
+        refused = value > disagreement_limits(kind, options)[1]
+        lone = _uncovered_mm(other, view) if refused else 0.0
+        findings += check_agreement(ids, value, kind, options, cut, lone)
     return findings
+
+
+def _uncovered_mm(first: VesselImage, second: VesselImage) -> float:
+    """Return the length across the planes of the beams that one alone shows vessel on, mm."""
+    a, b = (vessel_mass(view.carm, view.path_mm) for view in (first, second))
+    return 0.0 if a is None or b is None else uncovered(a, b, second.carm)
 
 
 def check_agreement(
     view_ids: tuple[str, str], disagreement: float, kind: str, options: QualityOptions,
-    cut: Sequence[str] = (),
+    cut: Sequence[str] = (), uncovered_mm: float = 0.0,
 ) -> list[str]:  # fmt: skip
     """Judge the disagreement of two views, 0 .. 1; returns and raises as ``check_consistency``.
 
-    ``cut``: the views that vessels run out of.
+    ``cut``: the views that vessels run out of; ``uncovered_mm``: as of ``check_asked``.
     """
     first, second = view_ids
     good, most = disagreement_limits(kind, options)
     if disagreement > most:
         why = f"vessels run out of view {cut[0]}, or " if cut else ""
+        if uncovered_mm >= MISSING_MM:
+            why += "vessels of one view are not filled or cut off, or "
         raise RefusedError(
             f"views {first} and {second} contradict each other: {disagreement:.0%} of the "
             f"vessels have {NO_MATCH} (at most {most:.0%}); "

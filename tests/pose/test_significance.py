@@ -64,12 +64,17 @@ def test_a_wrong_scale_of_one_view_is_asked_for_with_its_factor(factor):
     assert "not filled" not in said
 
 
-def test_vessel_that_is_not_filled_is_named_beside_a_scale_that_it_looks_like():
-    first, second = spoilt()
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_vessel_that_is_not_filled_is_named_beside_what_it_looks_like(calibrated):
+    """A scale, and where the pictures are exact, a contradiction."""
+    first, second = pair(calibrated=True)[1] if calibrated else spoilt()
     shown = np.arange(second.carm.rows)[:, None] < np.median(np.nonzero(second.path_mm)[0])
     half = {name: getattr(second, name) * shown for name in ("path_mm", "mask", "skeleton")}
     views = [first, dataclasses.replace(second, **half)]
     placed = register(pair()[0], views, OPTIONS, lambda _: pytest.fail("two views need no tree"))
+    assert ("view are not filled or cut off, or different" in placed.refusal) == calibrated
+    if calibrated:
+        return
     said = next(text for text in placed.findings if "pixels were" in text)
     assert "SDD or SOD wrong, or are vessels of one view not filled or cut off" in said
 
