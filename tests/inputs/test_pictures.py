@@ -63,6 +63,14 @@ def test_masks_of_a_wrong_type(good_case, masks, words):  # noqa: F811
         Engine(options=THIN).reconstruct(files, geometry(), masks=masks)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_a_users_mask_of_nothing_or_of_far_too_much(good_case, share):  # noqa: F811
+    files = [good_case / "view1.png", good_case / "view2.png"]
+    mask = np.broadcast_to(np.arange(96) < share * 96, (96, 96))
+    with pytest.raises(ImageError, match=rf"mask 1 marks {share:.0%} of .*at most 35% can"):
+        prepare(files, geometry(), RunOptions(), {1: mask})
+
+
 @pytest.mark.parametrize("value", [1e300, 1e39, np.inf, np.nan, -1.0])
 @pytest.mark.filterwarnings("error")
 def test_counts_that_single_precision_does_not_hold(value):
