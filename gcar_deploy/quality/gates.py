@@ -212,7 +212,7 @@ def check_order(
     if other_order <= ratio * disagreement:
         return [
             f"views {first} and {second} agree about as well {instead}: the pictures do not tell "
-            "whether they are swapped"
+            "whether they are swapped, or of one patient"
         ], ""
     return [], ""
 
@@ -265,7 +265,8 @@ def check_motion(
     kind = kind_of(views)
     exact = kind == "exact"
     # The width of vessels differs by a quarter between right views, too: it cannot tell.
-    wider = {"mask": ", or one mask is drawn thicker", "raw": ", or one picture is blurred"}
+    wider = {"mask": ", one mask is drawn thicker, or they show different patients",
+             "raw": ", one picture is blurred, or they show different patients"}  # fmt: skip
     for view, (moved, undone, rigid) in zip(views, motions, strict=True):
         # What is measured leads: a wrong angle or distance looks like motion.
         told = (

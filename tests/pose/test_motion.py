@@ -134,5 +134,6 @@ def test_motion_that_bends_the_tree_degrades():
         assert said.startswith("view 2: beyond a shift the contours of the views disagree by ")
         assert "the heart moved between the runs, or an angle or distance is a little off" in said
     assert "drawn thicker" in undone and "drawn thicker" in left and "thicker" not in large
+    assert "different patients" in undone and "patients" not in large
     blurred = [dataclasses.replace(view, path_error=0.2, kind="raw") for view in views]
     assert "one picture is blurred" in check_motion(blurred, [none, (0.6, True, 0.02)], limits)[0]
