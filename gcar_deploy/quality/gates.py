@@ -144,6 +144,8 @@ def check_consistency(
 
 def _uncovered_mm(first: VesselImage, second: VesselImage) -> float:
     """Return the length across the planes of the beams that one alone shows vessel on, mm."""
+    if first is second:  # as the view that the others are compared with is
+        return 0.0
     a, b = (vessel_mass(view.carm, view.path_mm) for view in (first, second))
     return 0.0 if a is None or b is None else uncovered(a, b, second.carm)
 

@@ -63,7 +63,7 @@ def test_masks_of_a_wrong_type(good_case, masks, words):  # noqa: F811
         Engine(options=THIN).reconstruct(files, geometry(), masks=masks)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4])
+@pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_users_mask_of_nothing_or_of_far_too_much(good_case, share):  # noqa: F811
     files = [good_case / "view1.png", good_case / "view2.png"]
     mask = np.broadcast_to(np.arange(96) < share * 96, (96, 96))
