@@ -199,8 +199,9 @@ def _spacing(
             f"give it with --pixel-spacing MM (pixel_spacing_mm of an order){why}"
         )
     if own is None:
-        _check_field(header, frame, float(given or 0.0), notes)
-        return float(given or 0.0), float(given or 0.0)
+        side = float(given or 0.0)
+        _check_field(header, frame, side, notes)
+        return side, side
     if given is not None and max(abs(x / given - 1.0) for x in own) > 1e-3:
         notes.append(f"says {own[0]:g} mm pixel spacing itself; --pixel-spacing is not used for it")
     return own

@@ -88,9 +88,7 @@ def blocks(picture: Array, down: int, across: int) -> Iterator[Array]:
 
 def area_average(picture: Image, rows: int, columns: int) -> Image:
     """(rows, columns) mean of ``picture`` over each new pixel's area, any factor."""
-    down = _overlap(picture.shape[0], rows)
-    across = _overlap(picture.shape[1], columns)
-    return np.ascontiguousarray((across @ (down @ picture).T).T, dtype=np.float32)
+    return weighted(picture, _overlap(picture.shape[0], rows), _overlap(picture.shape[1], columns))
 
 
 def _overlap(old: int, new: int) -> Array:
