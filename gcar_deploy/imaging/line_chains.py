@@ -55,12 +55,22 @@ def chains(line: Mask, width_px: Image) -> list[Stretch]:
     return out
 
 
+def stretches_of(line: Mask) -> list[Stretch]:
+    """Return the ways from one end or fork of a line to the next, and the rings that have none."""
+    graph, pixels = LineGraph(line), _pixels(line)
+    return _between(graph, pixels, {pixel for pixel in pixels if len(graph.joined(pixel)) != 2})
+
+
+def _pixels(line: Mask) -> list[Pixel]:
+    return [(int(row), int(column)) for row, column in np.argwhere(line)]
+
+
 def _cut(graph: LineGraph, line: Mask, width_px: Image) -> tuple[list[Stretch], dict[Pixel, Pixel]]:
     """Return the stretches between forks and ends, and of each fork the place that it is part of.
 
     The bridge of a crossing is no stretch: its two forks are one place.
     """
-    pixels: list[Pixel] = [(int(row), int(column)) for row, column in np.argwhere(line)]
+    pixels = _pixels(line)
     nodes = {pixel for pixel in pixels if len(graph.joined(pixel)) != 2}
     forks = {pixel for pixel in nodes if len(graph.joined(pixel)) > 2}
     place = {fork: fork for fork in forks}
