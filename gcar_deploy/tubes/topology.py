@@ -23,6 +23,7 @@ from gcar_deploy.tubes.gauss_newton import empty_objective, rescaled
 from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
 from gcar_deploy.tubes.model import Shown
 from gcar_deploy.tubes.proposal import Told, proposal
+from gcar_deploy.tubes.relink import relinked
 from gcar_deploy.tubes.run import Run, State, Trial, coarsest_pixel_mm
 from gcar_deploy.tubes.targets import Target, make_targets, trial_views
 from gcar_deploy.types import Points
@@ -70,16 +71,15 @@ def settled_topology(
     """
     if run.evidence is None or len(views) < 2:
         return now
-    whole = loose_mm(now.tree) < LEAST_LOOSE_MM and not _lines(now, views, targets)[1]
-    if whole and not _doubted(now, run.progress.losses[-1], targets, run):
-        return now
     told, own, coarse = Told.by(run.evidence), targets, trial_views(views)
     if coarse is not views:
         views, targets = coarse, make_targets(coarse, 0.0, run.options)
     # What has to be beaten has had as many steps, from as near a start.
     best = given = run.tried(now.tree, targets)
+    best = relinked(given, views, targets, run, told)
+    whole = loose_mm(best.tree) < LEAST_LOOSE_MM and not _lines(best.state, views, targets)[1]
     if not whole:
-        best = _hung(_with_missed(given, views, targets, run, told), views, targets, run, told)
+        best = _hung(_with_missed(best, views, targets, run, told), views, targets, run, told)
     best = _with_partners(best, views, targets, run, told)
     if best is given:
         return now

@@ -83,7 +83,9 @@ def test_a_line_of_one_picture_alone_is_no_vessel():
 
 
 @pytest.mark.parametrize("told", [0, 1])
-def test_of_two_places_the_predictor_says_which(told):
+def test_of_two_places_the_predictor_says_which(told, monkeypatch):
+    # Asked of missed lines alone: both vessels together explain the second picture best.
+    monkeypatch.setattr("gcar_deploy.tubes.topology.relinked", lambda now, *_: now)
     truth, known, line = _with_twig()
     one, two = two_views()
     # What runs before it on the same rays of the first view is shown by the second alone.
@@ -107,6 +109,7 @@ def test_what_lowers_the_objective_too_little_is_left_out(monkeypatch):
     where = grid(64)
     views = _pictures(truth, two_views())
     monkeypatch.setattr("gcar_deploy.tubes.topology.EARNED", 0.95)
+    monkeypatch.setattr("gcar_deploy.tubes.relink.BETTER", 0.95)
     found = fit_tubes(
         points_of(known, where), views, OPTIONS, evidence=_believed(truth, where, 0.3)
     )
