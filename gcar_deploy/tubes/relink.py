@@ -32,6 +32,9 @@ DOUBTED, BESIDE_MM = 0.04, 1.0
 BETTER, PER_MM = 0.005, 0.05
 #: a trial whose objective is so many times as large after its first steps is given up
 HOPELESS = 1.5
+#: nothing is made of ways where the first tree of them leaves so many times as much: on generated
+#: pairs that were right already most do
+FAR = 1.7
 #: so many trials at most
 MOST_TRIALS = 100
 
@@ -60,8 +63,11 @@ def relinked(
     first = tree_of_ways(pairs, said, TRUSTS[0])
     if not first.branches or not _asked(now, Net.of(now.tree), Net.of(first), targets, run):
         return now
-    trees = [first, *(tree_of_ways(pairs, said, trust) for trust in TRUSTS[1:])]
-    tried = [run.tried(tree, targets) for tree in trees if tree.branches]
+    tried = [run.tried(first, targets, FAR * now.loss)]
+    if tried[0].loss > FAR * now.loss:
+        return now
+    trees = [tree_of_ways(pairs, said, trust) for trust in TRUSTS[1:]]
+    tried += [run.tried(tree, targets) for tree in trees if tree.branches]
     if run.progress.stopped:
         return now
     best, *others = sorted(tried, key=lambda one: one.loss)
