@@ -15,6 +15,10 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.types import Array, Image, Mask
 
+#: edges of pixels this near to each other, in pixels, are one: less is rounding (``GRAIN_DIGITS``),
+#: and a sliver of vessel would make a pixel vessel
+ONE_EDGE = 1e-4
+
 
 def resized(vessel_image: VesselImage, rows: int, columns: int) -> VesselImage:
     """Resample to (rows, columns) over the same field.
@@ -209,7 +213,7 @@ def _shares(old: int, anchor: float, scale: float) -> tuple[Array, float]:
     last = int(np.ceil((old - 0.5 - anchor) * scale - 1e-9))
     if scale < 1:
         return area_shares(anchor + np.arange(first, last + 1) / scale, old), -first - 0.5
-    at = np.clip(anchor + (np.arange(first, last) + 0.5) / scale, 0, old - 1)
+    at = np.clip(_snapped(anchor + (np.arange(first, last) + 0.5) / scale, 0.0), 0, old - 1)
     before = np.floor(at).astype(np.int64)
     after = np.minimum(before + 1, old - 1)
     new = np.arange(len(at))
@@ -218,12 +222,18 @@ def _shares(old: int, anchor: float, scale: float) -> tuple[Array, float]:
     return sparse.csr_matrix((weight, places), shape=(len(at), old)), -first - 0.5
 
 
+def _snapped(places: Array, off: float) -> Array:
+    """Put places within ``ONE_EDGE`` of a whole number and ``off`` there."""
+    whole = np.rint(places - off) + off
+    return np.where(np.abs(places - whole) < ONE_EDGE, whole, places)
+
+
 def area_shares(edges: Array, old: int) -> Array:
     """Share of each new pixel, between ``edges`` (new + 1,), that old ones fill, (new, old) sparse.
 
     Rows sum to 1: what lies beyond the old pixels does not count.
     """
-    edges = np.clip(edges, -0.5, old - 0.5)
+    edges = np.clip(_snapped(edges, 0.5), -0.5, old - 0.5)
     cuts = np.union1d(edges, np.arange(old + 1) - 0.5)
     middle = 0.5 * (cuts[:-1] + cuts[1:])
     new = np.clip(np.searchsorted(edges, middle) - 1, 0, len(edges) - 2)

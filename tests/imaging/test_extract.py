@@ -14,7 +14,14 @@ from gcar_deploy.imaging.extract import (
     extract_vessels,
 )
 from gcar_deploy.imaging.polarity import with_polarity
-from gcar_deploy.imaging.resample import area_average, coarsened, coarser_view, resize, resized
+from gcar_deploy.imaging.resample import (
+    area_average,
+    coarsened,
+    coarser_view,
+    resize,
+    resized,
+    stretched,
+)
 from gcar_deploy.imaging.widths import MASK_ERROR
 from tests.conftest import data_dir
 from tests.imaging.phantoms import PIXEL_MM, angiogram, carm, dice, raw_picture, tube_paths
@@ -329,6 +336,16 @@ def test_a_border_more_leaves_the_coarser_pixels_where_they_were():
     two, (b,) = coarsened(wide, (np.pad(picture, ((7, 0), (3, 0))),), 2.7)
     down, right = np.subtract(two.principal_point[::-1], one.principal_point[::-1]).astype(int)
     np.testing.assert_allclose(b[down:, right:], a, atol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "middle"), [(1 / 2.45, 29.5), (1.25, 29.6)])
+@pytest.mark.parametrize("border", [0, 7, 61])
+def test_pixels_that_meet_old_ones_take_nothing_of_the_next(scale, middle, border):
+    # Edges of larger pixels, or middles of smaller ones, fall on old ones but for rounding.
+    seen = dataclasses.replace(carm(151, 151), principal_point_px=(middle + border,) * 2)
+    _, down, across = stretched(seen, (scale, scale))
+    weights = np.concatenate([down.data, across.data])
+    assert not ((weights > 0) & (weights < 1e-3)).any()
 
 
 @pytest.mark.slow
