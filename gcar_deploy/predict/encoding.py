@@ -123,7 +123,7 @@ def _view_inputs(
         cv2.blur(path, (9, 9), borderType=cv2.BORDER_CONSTANT),
         cv2.dilate(path, np.ones((3, 3), np.uint8)),
         cv2.erode(path, np.ones((3, 3), np.uint8)),
-        cv2.distanceTransform((path > 0).astype(np.uint8), cv2.DIST_L2, 3),
+        _depth_in_vessel(path),
     ]
     sampled = bilinear_of(maps, pixels)
     n_ray = count[ray]
@@ -146,6 +146,15 @@ def _view_inputs(
     ).astype(np.float32)
     ray_path = path.ravel()[flat]
     return features, ray.reshape(-1).astype(np.int64), ray_path, weight.astype(np.float32)
+
+
+def _depth_in_vessel(path: Image) -> Image:
+    """Count steps of 0.955, and diagonal ones of 1.3693, to the nearest pixel that is not vessel.
+
+    OpenCV's own sum of them differs in its last digit with the size of the picture.
+    """
+    steps = cv2.distanceTransform((path > 0).astype(np.uint8), cv2.DIST_L2, 3)
+    return np.asarray(np.round(steps, 4))
 
 
 def _index_in_scene(candidates: Candidates) -> Array:

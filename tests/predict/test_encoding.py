@@ -3,6 +3,7 @@
 import dataclasses
 from unittest import mock
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +11,14 @@ from hypothesis import strategies as st
 
 from gcar_deploy.config import CandidateOptions
 from gcar_deploy.predict import encoding
-from gcar_deploy.predict.encoding import LEVELS, VIEW_FEATURES, _levels, _neighbours, encode
+from gcar_deploy.predict.encoding import (
+    LEVELS,
+    VIEW_FEATURES,
+    _depth_in_vessel,
+    _levels,
+    _neighbours,
+    encode,
+)
 from gcar_deploy.predict.hull import cubic_lattice, visual_hull
 from gcar_deploy.predict.lattices import shifted_lattice
 from gcar_deploy.predict.thinning import thin_hull
@@ -71,6 +79,18 @@ def test_what_a_border_adds_to_the_default_volume_changes_no_coarser_cell(number
         for name in ("parent", "neighbours", "children"):
             for a, b in zip(getattr(one, name), getattr(found[0], name), strict=True):
                 np.testing.assert_array_equal(a, b)
+
+
+def test_the_depth_in_a_vessel_has_no_digit_of_the_size_of_the_picture():
+    blob = np.zeros((60, 60), np.float32)
+    blob[tuple(np.random.default_rng(0).integers(8, 52, (2, 400)))] = 1
+    blob = cv2.dilate(blob, np.ones((7, 7), np.uint8))
+    expected = _depth_in_vessel(blob)
+    assert expected.max() > 3
+    for more in (1, 2, 3, 5, 9, 17, 66, 250):
+        wide = np.pad(blob, ((more, 2 * more), (more, 3)))
+        found = _depth_in_vessel(wide)[more : more + 60, more : more + 60]
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_members_and_children_are_rays_and_parents_inverted():
