@@ -16,7 +16,8 @@ import numpy as np
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.carm import CArm, separation_deg
-from gcar_deploy.geometry.scene import Intensity, default_grid
+from gcar_deploy.geometry.default_grid import default_grid
+from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Image, Points
 from gcar_export.scenes.grown_trees import grown_tree

@@ -91,11 +91,17 @@ def own_frame(carms: Sequence[CArm], names: Sequence[str]) -> OwnFrame:
             names[k],
         ),
     )
+    origin = nearest_point(
+        np.stack([carms[k].source_mm for k in order]), np.stack([carms[k].axes[2] for k in order])
+    )
+    return OwnFrame(tuple(order), origin, tuple(carms[k].sdd_mm for k in order))
+
+
+def nearest_point(sources_mm: Points, directions: Points) -> Points:
+    """Return the point nearest to (V, 3) rays of length 1, (3,) mm."""
     left, right = np.zeros((3, 3)), np.zeros(3)
-    for k in order:
-        ray = carms[k].axes[2]
+    for source, ray in zip(sources_mm, directions, strict=True):
         across = np.eye(3) - np.outer(ray, ray)
         left += across
-        right += across @ carms[k].source_mm
-    origin = np.linalg.lstsq(left, right, rcond=1e-6)[0].astype(np.float64)
-    return OwnFrame(tuple(order), origin, tuple(carms[k].sdd_mm for k in order))
+        right += across @ source
+    return np.linalg.lstsq(left, right, rcond=1e-6)[0].astype(np.float64)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.files import read_text
 from gcar_deploy.geometry.carm import CLINICAL_RANGES, CArm
+from gcar_deploy.geometry.default_grid import default_grid
 from gcar_deploy.geometry.fields import (
     LEAST_VIEWS,
     MAX_BYTES,
@@ -34,10 +34,6 @@ from gcar_deploy.geometry.grid import Grid
 SCHEMA = "gcar-geometry/1"
 KINDS = ("path_length", "attenuation", "raw", "mask")
 POLARITIES = ("auto", "dark", "bright")
-#: the default volume: voxels along each edge
-DEFAULT_SHAPE = 128
-#: the default volume never grows beyond this edge: the heart with its vessels fits, mm
-DEFAULT_EDGE_MM = 180.0
 #: bounds that keep the arithmetic finite: table positions, principal points, matrix entries
 MAX_OFFSET_MM, MAX_POINT_PX, MAX_ENTRY = 500.0, 1e5, 1e9
 
@@ -123,36 +119,8 @@ class Scene:
     warnings: tuple[str, ...] = ()
 
     def volume_grid(self) -> Grid:
-        """Return the grid asked for, or a cube round the isocentre that all views cover."""
+        """Return the grid asked for, or a cube that all views cover (``default_grid``)."""
         return self.grid if self.grid is not None else default_grid([v.carm for v in self.views])
-
-
-def default_grid(carms: list[CArm]) -> Grid:
-    """Cube of 128^3 voxels round the isocentre whose middle sphere every view sees whole.
-
-    It bounds the volume alone, not where vessels are looked for (``Grid.bounds``).
-    """
-    radius = DEFAULT_EDGE_MM / 2
-    for nth, carm in enumerate(carms, start=1):
-        c0, r0 = carm.principal_point
-        f_col, f_row = carm.focal_px
-        half = min(
-            (min(c0, carm.columns - 1 - c0) + 0.5) / f_col,
-            (min(r0, carm.rows - 1 - r0) + 0.5) / f_row,
-        )
-        # The cone's edge touches a sphere of SOD sin(half angle) round the isocentre.
-        seen = carm.sod_mm * math.sin(math.atan(half))
-        if seen < 0.5:  # of a volume each edge is 1 mm or more
-            raise GeometryError(
-                f"view {nth} sees no space round the isocentre: its principal point "
-                f"({c0:g}, {r0:g}) is at the edge of or outside the picture of {carm.columns} x "
-                f"{carm.rows} pixels; correct principal_point_px, or give a volume"
-            )
-        radius = min(radius, seen)
-    edge = 2 * radius
-    return Grid(
-        center_mm=(0.0, 0.0, 0.0), size_mm=(edge,) * 3, shape=(DEFAULT_SHAPE,) * 3, bounds=False
-    )
 
 
 def load_scene(path: str | Path) -> Scene:

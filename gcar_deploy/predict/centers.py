@@ -11,8 +11,8 @@ import numpy as np
 from gcar_deploy.config import CandidateOptions, RunOptions
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.carm import CArm
-from gcar_deploy.geometry.common_field import common_field
 from gcar_deploy.geometry.grid import Grid
+from gcar_deploy.geometry.search_space import search_spaces
 from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.resample import sampled_path
 from gcar_deploy.predict.center_predictor import CenterPredictor, Predictor, SingleViewPredictor
@@ -29,7 +29,7 @@ from gcar_deploy.tree.centerline import build_tree
 from gcar_deploy.tree.tree import Tree, empty_tree
 from gcar_deploy.types import Array, Image
 
-#: of a picture's lines so many mm must be without any point in the grid, and get one beside it
+#: of a picture's lines so many mm must be without any point in the cube, and get one beside it
 BESIDE_MM = 4.0
 #: a point is on a line within so many cells
 COVERED_CELLS = 1.5
@@ -98,21 +98,23 @@ def seen_by_all(
 ) -> Seen:
     """Find the points of a lattice over ``grid`` that all views see as vessel.
 
-    Where nobody asked for that grid and it leaves lines of a picture without any point, which
-    points beside it explain, the lattice is over all that every view sees: not always, since most
-    of what lies out there is ghosts. The lattice is as fine as the vessels want it and the
-    predictor knows it (``resolution``).
+    Where nobody asked for that grid the lattice is over a cube of the usual size. If that leaves
+    lines of a picture without any point, which points beside it explain, it is over a larger one:
+    not always, since most of what lies out there is ghosts. The lattice is as fine as the vessels
+    want it and the predictor knows it (``resolution``).
     """
     spec = predictor.model.spec if isinstance(predictor, CenterPredictor) else None
     wanted = resolution(views, grid, options, spec)
-    found = _hull_in(grid, views, wanted, options.candidates)
-    left = [] if grid.bounds else [_missed_mm(view, found.hull) for view in views]
-    if max(left, default=0.0) > BESIDE_MM:
-        space = common_field(grid, [view.carm for view in views])
-        wider = _hull_in(space, views, wanted, options.candidates)
-        now = (_missed_mm(view, wider.hull) for view in views)
+    usual, *wider = search_spaces(grid, wanted.cell_mm)
+    found = _hull_in(usual, views, wanted, options.candidates)
+    for space in wider:
+        left = [_missed_mm(view, found.hull) for view in views]
+        if max(left) <= BESIDE_MM:
+            break
+        more = _hull_in(space, views, wanted, options.candidates)
+        now = (_missed_mm(view, more.hull) for view in views)
         if max(a - b for a, b in zip(left, now, strict=True)) > BESIDE_MM:
-            found = wider
+            found = more
     hull = without_ghosts(found.hull, views, options.same_branch)
     sampled = tuple((*p, v.calibrated) for p, v in zip(found.paths, views, strict=True))
     return Seen(tuple(views), sampled, hull, encode(hull, sampled), found.candidates)

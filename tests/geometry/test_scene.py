@@ -195,12 +195,19 @@ def test_matrix_alone_is_enough():
 
 
 @pytest.mark.parametrize("point", [[0, 0], [511, 255], [-40, 255]])
-def test_a_principal_point_at_the_edge_is_named_where_no_volume_is_given(point):
-    """Not a key that the file does not hold."""
+def test_a_principal_point_at_the_edge_may_be_that_of_a_crop(point):
     scene = changed((*FIRST, "principal_point_px"), point)
+    scene["volume"] = None
+    grid = parse_scene(json.dumps(scene)).volume_grid()
+    assert grid.size_mm[0] > 20 and grid.center_mm != (0, 0, 0)
+
+
+def test_a_principal_point_without_common_space_is_named_where_no_volume_is_given():
+    """Not a key that the file does not hold."""
+    scene = changed((*FIRST, "principal_point_px"), [255, 5000])
     assert parse_scene(json.dumps(scene)).volume_grid().size_mm[0] > 1
     scene["volume"] = None
-    with pytest.raises(GeometryError, match=r"view 1 sees no space .* correct principal_point_px"):
+    with pytest.raises(GeometryError, match=r"view \d sees no space .* correct principal_point_px"):
         parse_scene(json.dumps(scene))
 
 
@@ -299,7 +306,7 @@ BEYOND_SCHEMA = (
     "disagrees with",
     "mm_per_count is missing",
     "at odds with a lone",
-    "sees no space round the isocentre",
+    "sees no space that the others see",
     "2^28",
 )
 
