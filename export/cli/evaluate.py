@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from gcar_deploy.errors import UsageError
-from gcar_export.cli.options import COUNT, FOLDER, OUT_FOLDER, counted
+from gcar_export.cli.options import COUNT, FILE, FOLDER, OUT_FOLDER, counted
 
 _SET_UPS = ["paper", "clinical", "moved", "raw"]
 _PROTOCOL = click.option(
@@ -81,6 +81,10 @@ def _list_methods(ctx: click.Context, _: click.Parameter, methods: str) -> str:
 @click.option("--cases", default="", help="Only these cases, comma-separated.")
 @_PAPER_STEPS
 @click.option(
+    "--model", type=FILE, help="Predictor of your own, an ONNX file, for the rows that ask one."
+)
+@click.option("--segmenter-model", type=FILE, help="Likewise, of raw pictures (protocol raw).")
+@click.option(
     "--engine",
     type=click.Choice(["processes", "dask"]),
     default="processes",
@@ -107,6 +111,8 @@ def evaluate(
     jobs: int,
     cases: str,
     paper_steps: int | None,
+    model: Path | None,
+    segmenter_model: Path | None,
     engine: str,
     scheduler: str | None,
     changed: str,
@@ -125,6 +131,7 @@ def evaluate(
     from gcar_export.evaluate import peers
     from gcar_export.evaluate import tables as evaluation_tables
     from gcar_export.evaluate.report import draw
+    from gcar_export.methods.own_models import OwnModels
     from gcar_export.methods.settings import MethodSettings
 
     options = evaluation.EvaluateOptions(
@@ -139,7 +146,10 @@ def evaluate(
         scheduler=scheduler,
         changed=changed,
         redo=words(redo),
-        settings=MethodSettings(paper_steps=paper_steps),
+        settings=MethodSettings(
+            paper_steps=paper_steps,
+            own=OwnModels(predictor=_absolute(model), segmenter=_absolute(segmenter_model)),
+        ),
     )
     reference = options.methods[0]
     if draw_only:
@@ -247,6 +257,10 @@ def paper_page(
     (out / "paper.md").write_text(text + "\n", encoding="utf-8")
     click.echo(text)
     click.echo(study.draw(rows, out))
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return path if path is None else path.absolute()
 
 
 def words(text: str) -> tuple[str, ...]:

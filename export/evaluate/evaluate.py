@@ -23,7 +23,7 @@ from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
 from gcar_export.evaluate.jobs import NO_CASE, Job, case_name, row_path, write_done
-from gcar_export.methods.settings import METHODS, MethodSettings
+from gcar_export.methods.settings import METHODS, RUNTIME_ROWS, MethodSettings
 from gcar_export.methods.solve import check_models
 from gcar_export.scenes.labels import case_stem
 from gcar_export.scenes.protocols import COMMON, PROTOCOLS
@@ -161,12 +161,14 @@ def evaluate(
     else:
         labels = find_labels(_given(options.data), options.cases)
     check_models(options.methods, options.settings)
+    _check_own(options)
     digests = {method: options.settings.digest(method) for method in options.methods}
+    models = {m: options.settings.own_models(m).said() for m in options.methods}
     data = {label: None if generated else _sha256(label) for label in labels}
     jobs = [
         Job(
             label=label, protocol=protocol, method=method, views=views, digest=digests[method],
-            data=data[label],
+            data=data[label], models=models[method],
         )
         for protocol in options.protocols
         for label in labels
@@ -200,6 +202,27 @@ def evaluate(
         raise UsageError(f"no case can be made: {next(iter(lost.values()))}")
     write_tables(rows, options.out, options.reference or options.methods[0])
     return rows
+
+
+def _check_own(options: EvaluateOptions) -> None:
+    """Refuse a model of the user's own that no row of these would ask.
+
+    Raises
+    ------
+    UsageError
+    """
+    own, methods = options.settings.own, ", ".join(options.methods)
+    asked = [options.settings.own_models(method) for method in options.methods]
+    if own.predictor and not any(one.predictor for one in asked):
+        raise UsageError(f"model {own.predictor} is asked by none of the methods {methods}")
+    greys = any(RUNTIME_ROWS[m].grey_masks for m in options.methods if m in RUNTIME_ROWS)
+    if own.segmenter and not (any(one.segmenter for one in asked) and (
+        "raw" in options.protocols or greys
+    )):  # fmt: skip
+        raise UsageError(
+            f"segmenter-model {own.segmenter} has nothing to do: protocol {options.protocol} with "
+            f"{methods} shows no raw pictures in which a network finds vessels; take protocol raw"
+        )
 
 
 def without_case(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:

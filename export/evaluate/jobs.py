@@ -49,6 +49,7 @@ class Job:
     protocol, method, views : what to do with it
     digest : of the method's settings; a row with another one is out of date
     data : SHA-256 of the label file, likewise; None for a tree that is generated
+    models : models of the user's own that it asks, in words
     """
 
     label: Path
@@ -57,6 +58,7 @@ class Job:
     views: int
     digest: str
     data: str | None
+    models: str = ""
 
     @property
     def case(self) -> str:
@@ -133,6 +135,7 @@ def _row(job: Job, status: str, sentence: str) -> dict[str, Any]:
         "cpu_seconds": None,
         "stages": {},
         "settings": job.digest,
+        "models": job.models,
         "label_sha256": job.data,
     }
 

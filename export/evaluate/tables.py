@@ -51,7 +51,7 @@ SOME = (
     "shifted_dsc", "cd_mm", "parts", "found_1mm", "true_1mm",
     "new_dsc", "new_psnr_db", "new_psnr_masked_db", "ssim",
 )  # fmt: skip
-_NAMES = ("protocol", "dataset", "case", "method", "views", "status", "sentence")
+_NAMES = ("protocol", "dataset", "case", "method", "views", "status", "sentence", "models")
 #: p below -> stars, as in the paper's figures.
 STARS = ((0.0001, "****"), (0.001, "***"), (0.01, "**"), (0.05, "*"))
 
@@ -98,7 +98,9 @@ def _row_of(line: Mapping[str, str]) -> dict[str, Any]:
     reasons = [part.split(": ", 1) for part in line["undefined"].split("; ") if part]
     stages = {k.removeprefix("seconds_"): v for k, v in number.items() if k.startswith("seconds_")}
     return {
-        **{name: line[name] for name in _NAMES},
+        # Tables of earlier versions know no models of the user's own.
+        **{name: line[name] for name in _NAMES if name != "models"},
+        "models": line.get("models", ""),
         "views": int(line["views"]),
         "measures": {name: number.get(name) for name in (*MEASURES, "best_threshold")},
         "reasons": dict(reasons),
@@ -182,10 +184,20 @@ def markdown(rows: Sequence[Mapping[str, Any]], reference: str | None = None) ->
                 cells.append(mean_sd(entry[name], column, cases) + stars)
             out.append("| " + " | ".join(cells) + " |")
         out.append("")
+    out += _own_models(rows)
     out.append("Mean ± SD. (n=k) where a measure is defined for fewer cases than the table has.")
     if reference is not None:
         out.append(f"Wilcoxon signed rank against {reference}: {_star_key()}.")
     return "\n".join(out) + "\n"
+
+
+def _own_models(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines, one for each choice of the user's own models, with the methods that asked them."""
+    lines = []
+    for (models,), group in grouped([r for r in rows if r.get("models")], ("models",)).items():
+        methods = ", ".join(dict.fromkeys(row["method"] for row in group))
+        lines.append(f"{methods}: with {models}, not with what comes along.\n")
+    return lines
 
 
 def over_views(rows: Sequence[Mapping[str, Any]], name: str = "dsc") -> str:

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from gcar_deploy.config import (
@@ -23,6 +22,7 @@ from gcar_deploy.config import (
 from gcar_deploy.errors import UsageError
 from gcar_export.methods.fdk import FdkOptions
 from gcar_export.methods.nerp import NerpOptions
+from gcar_export.methods.own_models import OwnModels, sha256
 from gcar_export.methods.sart import SartOptions
 from gcar_export.methods.visual_hull import PATH_THRESHOLD_MM
 
@@ -144,6 +144,7 @@ class MethodSettings:
         the row
     backend : what projects Gaussians in these rows; numba is ten times as fast as NumPy
     run : the runtime's options
+    own : models in place of those that come along
     """
 
     fdk: FdkOptions = dataclasses.field(default_factory=FdkOptions)
@@ -154,6 +155,7 @@ class MethodSettings:
     paper_steps: int | None = None
     backend: Backend = "numba"
     run: RunOptions = dataclasses.field(default_factory=RunOptions)
+    own: OwnModels = dataclasses.field(default_factory=OwnModels)
 
     def __post_init__(self) -> None:
         if self.paper_steps is not None and not 1 <= self.paper_steps <= 100_000:
@@ -185,6 +187,12 @@ class MethodSettings:
             ),
         )
 
+    def own_models(self, method: str) -> OwnModels:
+        """Return those of ``own`` that a method asks; none but rows of the runtime asks any."""
+        if method not in RUNTIME_ROWS:
+            return OwnModels()
+        return self.own.used(self.run_options(method))
+
     def started_options(self, method: str) -> PaperOptions:
         """Return the paper's refinement for a method of ``START_ROWS``."""
         return self._limited(START_ROWS[method])
@@ -196,12 +204,13 @@ class MethodSettings:
     def of(self, method: str) -> dict[str, Any]:
         """Everything that the result of ``method`` depends on, as plain values."""
         if method in RUNTIME_ROWS:
-            options = self.run_options(method)
+            options, own = self.run_options(method), self.own_models(method)
+            shipped = {} if own.predictor else _shipped(options.predict.predictor)
             out = {
                 "run": {k: v for k, v in dataclasses.asdict(options).items() if k in _STAGES},
                 "swapped": RUNTIME_ROWS[method].swapped,
                 "grey_masks": RUNTIME_ROWS[method].grey_masks,
-                "models": _model_hashes(options.predict.predictor),
+                "models": shipped | {path.name: sha256(path) for path in own.files},
             }
         elif method in START_ROWS:
             out = {
@@ -222,14 +231,10 @@ class MethodSettings:
 
 
 @functools.cache
-def _model_hashes(predictor: str) -> dict[str, str]:
+def _shipped(predictor: str) -> dict[str, str]:
     """SHA-256 of the shipped models that a predictor may use, by file name."""
     from gcar_deploy.predict.kinds import PREDICTOR_KINDS
 
     kinds = {"auto": ("multi",), "none": ()}.get(predictor, (predictor,))
     paths = [PREDICTOR_KINDS[kind].path for kind in kinds]
-    return {p.name: _sha256(p) for p in paths if p is not None}
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return {p.name: sha256(p) for p in paths if p is not None}

@@ -20,6 +20,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Image, Points, Volume
+from gcar_export.methods.own_models import OwnModels
 from gcar_export.methods.settings import (
     METHODS,
     RUNTIME_ROWS,
@@ -74,7 +75,9 @@ def solve(case: Case, method: str, settings: MethodSettings | None = None) -> So
     try:
         if method in RUNTIME_ROWS:
             options = settings.run_options(method)
-            return _runtime(case, options, RUNTIME_ROWS[method])
+            own = settings.own_models(method)
+            session = _session(options, own, own.said())
+            return _runtime(case, session, RUNTIME_ROWS[method])
         _warm_up(method)
         clock = _Clock()
         if method in START_ROWS:
@@ -111,7 +114,8 @@ def check_models(methods: Sequence[str], settings: MethodSettings) -> None:
     for method in methods:
         if method in RUNTIME_ROWS:
             try:
-                _session(settings.run_options(method))
+                own = settings.own_models(method)
+                _session(settings.run_options(method), own, own.said())
             except ModelError as error:
                 raise ModelError(f"method {method}: {error}") from None
 
@@ -137,22 +141,21 @@ class _Session:
 
 
 @functools.cache
-def _session(options: RunOptions) -> _Session:
-    """One session per set of options and process.
+def _session(options: RunOptions, own: OwnModels, _: str) -> _Session:
+    """One session per set of options, models (and what is in their files) and process.
 
     Without its model the runtime falls back to the hull; a row must never do so unsaid.
     """
     from gcar_deploy.engine import Engine
 
-    engine = Engine(options=options)
+    engine = Engine(model=own.predictor, options=options, segmenter_model=own.segmenter)
     predictor = options.predict.predictor
     if predictor != "none" and engine.model is None:
         raise ModelError(f"predictor {predictor} has no model in this version")
     return _Session(engine)
 
 
-def _runtime(case: Case, options: RunOptions, row: RuntimeRow) -> Solved:
-    session = _session(options)
+def _runtime(case: Case, session: _Session, row: RuntimeRow) -> Solved:
     angiograms, grid = case.angiograms(), case.grid
     if row.swapped:
         angiograms = angiograms[::-1]

@@ -60,7 +60,7 @@ class PerfectEngine:
     answers: dict = {}  # noqa: RUF012
     model = {"name": "stub"}  # noqa: RUF012
 
-    def __init__(self, *, options=None):
+    def __init__(self, *, model=None, options=None, segmenter_model=None):
         self.options = options
 
     def warmup(self):
@@ -416,7 +416,7 @@ def _row(case, method, dsc):
     measures = dict.fromkeys(evaluation_tables.MEASURES) | {"dsc": dsc}
     return {
         "protocol": "paper", "dataset": "ImageCAS", "views": 2, "case": case, "method": method,
-        "status": "ok", "sentence": "", "measures": measures, "gaussians": None, "seconds": 1.0,
+        "status": "ok", "sentence": "", "models": "", "measures": measures, "gaussians": None, "seconds": 1.0,
         "cpu_seconds": 2.0,
         "stages": {}, "reasons": {},
     }  # fmt: skip
