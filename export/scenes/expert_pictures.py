@@ -28,6 +28,10 @@ ZOOM = (0.75, 1.6)
 DRAWN_SHARE = 0.6
 #: so many pictures are named one by one: manifests and specs are bounded
 MOST_NAMED = 150
+#: a mask of more values than two is vessel above this one, half of 8 bits
+HALF_GREY = 127
+#: vessels cover no more than this share of a picture: what does is ground, or the wrong way round
+MOST_DRAWN = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,13 +67,13 @@ def expert_pictures(folder: Path) -> tuple[ExpertPicture, ...]:
     Raises
     ------
     ImageError
-        No picture with a mask of the same size.
+        No picture with a mask of the same size; a mask that is none.
     """
     paths = sorted(folder.glob("*_gt.png"), key=lambda p: (len(p.name), p.name))
     found = []
     for path in paths:
         name = path.name.removesuffix("_gt.png")
-        pixels, mask = read_picture(path.with_name(f"{name}.png"))[0], read_picture(path)[0] > 127
+        pixels, mask = read_picture(path.with_name(f"{name}.png"))[0], expert_mask(path)
         if pixels.shape != mask.shape:
             raise ImageError(f"{path}: {mask.shape} pixels, but its picture has {pixels.shape}")
         chord = mask_path(mask, 1.0) / np.float32(DRAWN_SHARE)
@@ -77,6 +81,36 @@ def expert_pictures(folder: Path) -> tuple[ExpertPicture, ...]:
     if not found:
         raise ImageError(f"{folder}: no N.png with N_gt.png")
     return tuple(found)
+
+
+def expert_mask(path: Path) -> Mask:
+    """Read where an expert drew vessels, (rows, cols) bool.
+
+    Of two values (0 and 1, 0 and 255, whatever they are) the larger one is vessel; of more values
+    those above ``HALF_GREY``.
+
+    Raises
+    ------
+    ImageError
+        It is no picture; nothing is drawn in it, or nearly everything.
+    """
+    grey = read_picture(path, binary=True)[0]
+    low, high = float(grey.min()), float(grey.max())
+    two = bool(((grey == low) | (grey == high)).all())
+    mask = grey > (low if two else HALF_GREY)
+    share = float(mask.mean())
+    if not share:
+        said = (
+            f"every pixel is {low:g}"
+            if two
+            else f"of more than two values none is above {HALF_GREY}"
+        )
+        raise ImageError(f"{path}: nothing is drawn in it: {said}")
+    if share > MOST_DRAWN:
+        raise ImageError(
+            f"{path}: {share:.0%} of it is drawn as vessel; vessels are the larger value"
+        )
+    return mask
 
 
 def named(folder: Path, pictures: Sequence[ExpertPicture]) -> dict[str, str]:

@@ -14,6 +14,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.output.overlay import grey8, png_bytes
 from gcar_deploy.types import Array, Mask
+from gcar_export.scenes.expert_pictures import expert_mask
 
 #: found and drawn by the expert, found alone, drawn alone, taken for a catheter (blue, green, red)
 _BOTH, _ALONE, _MISSED, _DEVICE = (60, 200, 60), (60, 90, 255), (255, 130, 70), (0, 170, 255)
@@ -39,7 +40,7 @@ def write_page(seen: Sequence[tuple[Path, VesselImage, Mapping[str, float]]], ou
     for path, found, scores in seen:
         name = path.name.removesuffix("_gt.png")
         pixels = read_picture(path.with_name(f"{name}.png"))[0]
-        drawn = marked(grey8(pixels), found, read_picture(path)[0] > 127)
+        drawn = marked(grey8(pixels), found, expert_mask(path))
         data = base64.b64encode(png_bytes(drawn)).decode()
         caption = f"{name}: Dice {scores['Dice']:.2f}, clDice {scores['clDice']:.2f}"
         parts.append(

@@ -32,7 +32,7 @@ from gcar_deploy.imaging.net import Segmenter, load_segmenter, open_segmenter
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.skeleton import skeletonize
 from gcar_deploy.types import Image, Mask
-from gcar_export.scenes.expert_pictures import fold_edges
+from gcar_export.scenes.expert_pictures import expert_mask, fold_edges
 from gcar_export.scenes.sanity_pictures import EACH, sanity_picture
 from gcar_export.studies import segmentation_time
 from gcar_export.studies.segmentation_page import write_page
@@ -131,7 +131,7 @@ def expert_score(
     pixel_mm: float | None = None,
 ) -> tuple[dict[str, float], VesselImage]:
     """Score one expert-masked picture; ``who`` finds the vessels, with ``net`` where given."""
-    truth = read_picture(truth_path)[0] > 127
+    truth = expert_mask(truth_path)
     picture = truth_path.with_name(truth_path.name.replace("_gt", ""))
     angiogram = Angiogram.without_geometry(
         picture.stem, read_picture(picture), Intensity(kind="raw"), pixel_mm

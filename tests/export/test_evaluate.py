@@ -416,8 +416,8 @@ def _row(case, method, dsc):
     measures = dict.fromkeys(evaluation_tables.MEASURES) | {"dsc": dsc}
     return {
         "protocol": "paper", "dataset": "ImageCAS", "views": 2, "case": case, "method": method,
-        "status": "ok", "sentence": "", "models": "", "measures": measures, "gaussians": None, "seconds": 1.0,
-        "cpu_seconds": 2.0,
+        "status": "ok", "sentence": "", "models": "", "measures": measures,
+        "gaussians": None, "seconds": 1.0, "cpu_seconds": 2.0,
         "stages": {}, "reasons": {},
     }  # fmt: skip
 

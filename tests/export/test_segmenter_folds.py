@@ -13,7 +13,7 @@ torch = pytest.importorskip("torch", reason="needs the export extra")
 from safetensors.torch import load_file  # noqa: E402
 
 from gcar_deploy.errors import ImageError, UsageError  # noqa: E402
-from gcar_export.scenes.expert_pictures import expert_pictures, folds  # noqa: E402
+from gcar_export.scenes.expert_pictures import expert_mask, expert_pictures, folds  # noqa: E402
 from gcar_export.training.segmenter import (  # noqa: E402
     TINY,
     chosen,
@@ -43,6 +43,32 @@ def test_folds_leave_each_picture_out_once(drawn):
         left_out += [p.name for p in held]
         assert beside[k][0] == (k, 3) and [pictures[n] for n in beside[k][1]] == list(held)
     assert left_out == [p.name for p in pictures]
+
+
+@pytest.mark.parametrize(("ground", "vessel"), [(0, 1), (0, 255), (1, 2), (40, 90)])
+def test_of_two_values_the_larger_is_vessel(drawn, tmp_path, ground, vessel):
+    drawn_so = cv2.imread(str(drawn / "3_gt.png"), cv2.IMREAD_UNCHANGED) > 0
+    cv2.imwrite(str(tmp_path / "3_gt.png"), np.where(drawn_so, vessel, ground).astype(np.uint8))
+    shutil.copy(drawn / "3.png", tmp_path)
+    (one,) = expert_pictures(tmp_path)
+    assert np.array_equal(one.mask, drawn_so)
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda m: 0 * m, "nothing is drawn in it: every pixel is 0"),
+    (lambda m: 0 * m + 255, "nothing is drawn in it: every pixel is 255"),
+    (lambda m: 255 - m, "of it is drawn as vessel"),
+    (lambda m: np.where(m > 0, 1, 0) + np.eye(*m.shape), "of more than two values none is"),
+])  # fmt: skip
+def test_a_mask_that_is_none_is_refused_by_name(drawn, tmp_path, change, said):
+    mask = cv2.imread(str(drawn / "3_gt.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(tmp_path / "3_gt.png"), change(mask).astype(np.uint8))
+    shutil.copy(drawn / "3.png", tmp_path)
+    with pytest.raises(ImageError, match=f"3_gt.png: .*{said}"):
+        expert_pictures(tmp_path)
+    grey = np.linspace(0, 255, mask.size).reshape(mask.shape)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.where(mask > 0, 200, grey / 3).astype(np.uint8))
+    assert np.array_equal(expert_mask(tmp_path / "grey.png"), mask > 0)
 
 
 @pytest.mark.slow
