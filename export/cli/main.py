@@ -18,6 +18,7 @@ from gcar_export.cli.options import DURATION, FILE, FOLDER, FROM_ZERO, OUT_FILE,
 from gcar_export.cli.refine import cost_curves, flow_table, refine_table, sigma_table, speed_table
 from gcar_export.cli.training import train, train_devices, train_segmenter
 from gcar_export.cli.wrong_scenes import wrong_scenes
+from gcar_export.training.scene_stream import Terminated
 
 
 class _Group(click.Group):
@@ -29,9 +30,14 @@ class _Group(click.Group):
         except GcarError as error:
             click.echo(f"gcar-export: error: {error}", err=True)
             sys.exit(error.exit_code)
+        except Terminated:
+            click.echo("gcar-export: terminated", err=True)
+            sys.exit(143)
         except KeyboardInterrupt:
             click.echo("gcar-export: interrupted", err=True)
             sys.exit(130)
+        except BrokenPipeError:  # the reader of stdout went away, as ``head`` does: click ends it
+            raise
         except (click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except ImportError as error:
@@ -46,8 +52,8 @@ class _Group(click.Group):
 
 def _said(error: Exception) -> str:
     """One line about an error that nobody raised on purpose."""
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'cannot write'}: {error.strerror}"
     detail = (str(error).splitlines() or [""])[0][:200]
     return f"internal: {type(error).__name__} {detail}; see -v"
 

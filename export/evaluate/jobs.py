@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from gcar_export.scenes.labels import LabelVolume, case_stem, read_label
 from gcar_export.scenes.protocols import COMMON, Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
 from gcar_export.scenes.thin_protocol import THIN, line_measures, thin_case
+from gcar_export.scenes.whole_file import whole_file
 
 #: name that the truth's own pictures are kept under, beside the methods.
 TRUTH = "truth"
@@ -233,9 +233,8 @@ def write_done(out: Path, job: Job, done: Done) -> None:
 
 
 def _replace(path: Path, content: bytes) -> None:
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_bytes(content)
 
 
 # A worker outlives an evaluation: what it keeps is tied to what is in the file.

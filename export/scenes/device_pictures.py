@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from gcar_export.scenes.cine import cine_pair
 from gcar_export.scenes.drawn_devices import drawn_devices as drawn
 from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.scenes.raw_angiograms import raw_angiogram
+from gcar_export.scenes.whole_file import whole_file
 
 #: enlargement of a picture that fills the network's field, and how far it is turned, degrees
 ZOOM, TURN_DEG = (1.0, 1.2), 8.0
@@ -145,13 +145,11 @@ def pooled_device_picture(
     if not path.exists():
         made = device_picture(seed, index, segmenter, real)
         folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}.tmp")
-        with part.open("wb") as file:
+        with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file, points=made.lines.points.astype(np.float16), label=made.label,
                 pixels=made.lines.pixels.astype(np.int16), lengths=made.lines.lengths,
             )  # fmt: skip
-        part.replace(path)
     with np.load(path) as data:
         lengths = tuple(int(n) for n in data["lengths"])
         near = line_strips.near_points(lengths)

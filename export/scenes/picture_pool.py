@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import os
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from gcar_export.scenes import (
 from gcar_export.scenes.angiograms import GeneratedAngiogram, asked_of, generated_angiogram
 from gcar_export.scenes.augmented import Labelled
 from gcar_export.scenes.raw_angiograms import raw_angiogram
+from gcar_export.scenes.whole_file import whole_file
 
 #: enlargement of a crop, and of a raw picture's, which is twice as fine
 ZOOM, RAW_ZOOM = (0.9, 1.3), (0.62, 1.0)
@@ -54,10 +54,8 @@ def pooled(folder: Path, seed: int, index: int) -> Labelled:
         made = drawn(seed, index)
         folder.mkdir(parents=True, exist_ok=True)
         asked = asked_of(made).astype(np.float16)
-        part = path.with_suffix(f".{os.getpid()}.tmp")
-        with part.open("wb") as file:
+        with whole_file(path) as part, part.open("wb") as file:
             np.savez_compressed(file, pixels=made.pixels, asked=asked)
-        part.replace(path)
     with np.load(path) as data:
         asked, fine = data["asked"].astype(np.float32), index % RAW_EVERY == 0
         return Labelled(data["pixels"], asked, RAW_ZOOM if fine else ZOOM)

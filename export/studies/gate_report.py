@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.quality import check_order, disagreement_limits
 from gcar_deploy.quality.status import DEGRADED, OK, REFUSED
+from gcar_export.scenes.whole_file import whole_file
 from gcar_export.studies.gate_pairs import KINDS, PICTURES, UNITS, WRONG
 from gcar_export.studies.gate_rows import Row
 from gcar_export.studies.gate_table import GATES, choose, cost, kind_of_row, replayed, with_gate
@@ -172,9 +172,8 @@ def draw(rows: Sequence[Row], gates: QualityOptions, file: Path) -> None:
         panel.set(xscale="log", yscale="log", xlabel="disagreement as given, %",
                   ylabel="pictures exchanged, %")  # fmt: skip
         panel.legend(fontsize=7)
-    partial = file.with_name(f"{file.stem}.tmp.png")
-    figure.savefig(partial, dpi=110)
-    os.replace(partial, file)
+    with whole_file(file) as partial:
+        figure.savefig(partial, dpi=110, format="png")
 
 
 def _histogram(panel: Any, rows: Sequence[Row], pictures: str, gates: tuple[float, float]) -> None:

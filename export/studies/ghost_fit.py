@@ -10,7 +10,6 @@ is fitted: a reliability table and picture, and the calibration slope and interc
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from scipy.special import expit, logit
 
 from gcar_deploy.quality import FIGURES, GHOST_MM, GhostModel
 from gcar_deploy.types import Array, Scalars
+from gcar_export.scenes.whole_file import whole_file
 from gcar_export.studies.gate_pairs import PICTURES
 from gcar_export.studies.gate_rows import Row
 
@@ -188,6 +188,5 @@ def draw(model: GhostModel, groups: Mapping[str, Sequence[Row]], file: Path) -> 
     panel.set(xlabel="stated probability of a ghost, %", ylabel="vessel that is a ghost, %",
               xlim=(-2, 102), ylim=(-2, 102))  # fmt: skip
     panel.legend(fontsize=8)
-    partial = file.with_name(f"{file.stem}.tmp.png")
-    figure.savefig(partial, dpi=110)
-    os.replace(partial, file)
+    with whole_file(file) as partial:
+        figure.savefig(partial, dpi=110, format="png")

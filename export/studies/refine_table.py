@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -38,6 +37,7 @@ from gcar_export.evaluate.tables import STARS
 from gcar_export.scenes.labels import read_label
 from gcar_export.scenes.protocols import Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
+from gcar_export.scenes.whole_file import whole_file
 
 NOISES = (0.0, 0.5, 1.0, 2.0)
 DROPPED = 0.1
@@ -280,6 +280,5 @@ def _keep(file: Path | None, row: Row) -> None:
     if file is None:
         return
     file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(f"{file.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(dataclasses.asdict(row)), encoding="utf-8")
-    partial.replace(file)
+    with whole_file(file) as partial:
+        partial.write_text(json.dumps(dataclasses.asdict(row)), encoding="utf-8")

@@ -24,7 +24,6 @@ import csv
 import dataclasses
 import hashlib
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -45,6 +44,7 @@ from gcar_export.evaluate.evaluate import find_labels
 from gcar_export.scenes.labels import LabelVolume, case_stem, read_label
 from gcar_export.scenes.protocols import MM_PER_COUNT
 from gcar_export.scenes.raycast import raycast
+from gcar_export.scenes.whole_file import whole_file
 
 CURVES: dict[str, tuple[float, ...]] = {
     "separation": (25, 35, 45, 60, 75, 90),
@@ -247,9 +247,8 @@ def draw(rows: Sequence[dict[str, str]], file: Path) -> None:
         panel.tick_params(labelsize=7)
         if not k:
             panel.set_ylabel("volume DSC at 0.5, %", fontsize=9)
-    partial = file.with_name("robustness.tmp.png")
-    figure.savefig(partial, dpi=120)
-    os.replace(partial, file)
+    with whole_file(file) as partial:
+        figure.savefig(partial, dpi=120, format="png")
 
 
 def read_rows(file: Path) -> list[dict[str, str]]:
@@ -261,18 +260,15 @@ def read_rows(file: Path) -> list[dict[str, str]]:
 
 
 def _write_rows(file: Path, rows: Sequence[dict[str, str]]) -> None:
-    partial = file.with_suffix(".tmp")
-    with partial.open("w", newline="", encoding="utf-8") as f:
+    with whole_file(file) as partial, partial.open("w", newline="", encoding="utf-8") as f:
         writer = csv.DictWriter(f, FIELDS)
         writer.writeheader()
         writer.writerows(rows)
-    os.replace(partial, file)
 
 
 def _write(file: Path, content: bytes) -> None:
-    partial = file.with_name(file.name + ".tmp")
-    partial.write_bytes(content)
-    os.replace(partial, file)
+    with whole_file(file) as partial:
+        partial.write_bytes(content)
 
 
 def _settings(engine: Engine) -> str:

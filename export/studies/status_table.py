@@ -11,7 +11,6 @@ share of right pairs of path lengths that stay ``ok`` (``LEAST_OK`` is asked for
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import numpy as np
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.quality.status import DEGRADED, OK, REFUSED
 from gcar_deploy.types import Array
+from gcar_export.scenes.whole_file import whole_file
 from gcar_export.studies.gate_pairs import PICTURES, WRONG
 from gcar_export.studies.gate_rows import Row
 from gcar_export.studies.gate_table import GATES, expected_ghosts, replayed, with_gate
@@ -123,6 +123,5 @@ def draw(groups: Mapping[str, Sequence[Row]], gates: QualityOptions, file: Path)
     curve.set(xlabel="good pairs above the gate, %", ylabel="bad pairs above the gate, %")
     cloud.set(xlabel="expected in ghosts, % of the length", ylabel="volume DSC, %")
     curve.legend(fontsize=8)
-    partial = file.with_name(f"{file.stem}.tmp.png")
-    figure.savefig(partial, dpi=110)
-    os.replace(partial, file)
+    with whole_file(file) as partial:
+        figure.savefig(partial, dpi=110, format="png")

@@ -12,7 +12,6 @@ import collections
 import contextlib
 import csv
 import json
-import os
 import platform
 import shutil
 import signal
@@ -25,9 +24,11 @@ from typing import Any, Protocol, TypeVar
 import click
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from gcar_deploy.errors import ModelError, UsageError
+from gcar_export.scenes.whole_file import whole_file
+from gcar_export.training.scene_stream import Terminated
 from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
 
 SCHEMA = "gcar-training/1"
@@ -182,8 +183,6 @@ class RunFolder:
                 data[f"opt.{name}.{key}"] = _kept(value)
         data["step"] = torch.tensor(step)
         data["losses"] = torch.tensor(list(self.losses), dtype=torch.float64)
-        partial = self.path / "checkpoint.tmp"
-        save_file(data, partial)
         self.manifest.update(extra or {})
         self.manifest["step"] = step
         self.manifest["versions"] = {
@@ -194,7 +193,8 @@ class RunFolder:
         # A checkpoint is never without a manifest, not even if this is cut off here.
         if not (self.path / "manifest.json").is_file():
             self._write_manifest()
-        os.replace(partial, self.checkpoint)
+        with whole_file(self.checkpoint) as partial:
+            partial.write_bytes(save(data))
         self._write_manifest()
 
     def interrupt(self, step: int) -> None:
@@ -205,16 +205,15 @@ class RunFolder:
         """Copy the checkpoint just saved to best.safetensors if no earlier error was lower."""
         if error >= self.manifest.get("best", {"error": np.inf})["error"]:
             return
-        partial = self.path / "best.tmp"
-        shutil.copy(self.checkpoint, partial)
-        os.replace(partial, self.path / "best.safetensors")
+        with whole_file(self.path / "best.safetensors") as partial:
+            shutil.copy(self.checkpoint, partial)
         self.manifest["best"] = {"step": step, "error": error, "validation": dict(scores)}
         self._write_manifest()
 
     def _write_manifest(self) -> None:
         text = json.dumps(self.manifest, indent=1) + "\n"
-        (self.path / "manifest.tmp").write_text(text, encoding="utf-8")
-        os.replace(self.path / "manifest.tmp", self.path / "manifest.json")
+        with whole_file(self.path / "manifest.json") as partial:
+            partial.write_text(text, encoding="utf-8")
 
     def log(self, step: int, scores: Mapping[str, Mapping[str, float]], validation: Any) -> None:
         """Add one validation (kind of scene -> measure -> value) to log.csv and redraw the curve.
@@ -229,15 +228,13 @@ class RunFolder:
         header = ["step", "loss", "kind", *names]
         file = self._log
         rows = [r for r in read_log(file) if int(r["step"]) < step]
-        partial = file.with_suffix(".tmp")
-        with partial.open("w", newline="", encoding="utf-8") as f:
+        with whole_file(file) as partial, partial.open("w", newline="", encoding="utf-8") as f:
             writer = csv.DictWriter(f, header, extrasaction="ignore")
             writer.writeheader()
             writer.writerows(rows)
             for kind, score in scores.items():
                 shown = {k: f"{v:.4f}" for k, v in score.items()}
                 writer.writerow({"step": step, "loss": f"{loss:.4f}", "kind": kind, **shown})
-        os.replace(partial, file)
         self._scored = step
         draw_curve(read_log(file), self.path / "curve.png")
 
@@ -277,17 +274,19 @@ def until_interrupted(stop: Flag | None = None) -> Iterator[Flag]:
     Raises
     ------
     KeyboardInterrupt
-        At the end, where the flag is up.
+        At the end, where the flag is up; ``Terminated`` where SIGTERM raised it.
     """
     stop = stop or threading.Event()
     main = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in STOPS}
+    raised: list[int] = []
 
     def back() -> None:
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    def interrupted(*_: object) -> None:
+    def interrupted(number: int, _: object) -> None:
+        raised.append(number)
         back()
         stop.set()
 
@@ -296,11 +295,15 @@ def until_interrupted(stop: Flag | None = None) -> Iterator[Flag]:
             signal.signal(number, interrupted)
     try:
         yield stop
+    except KeyboardInterrupt:
+        if raised == [signal.SIGTERM]:
+            raise Terminated from None
+        raise
     finally:
         if main:
             back()
     if stop.is_set():
-        raise KeyboardInterrupt
+        raise Terminated if raised == [signal.SIGTERM] else KeyboardInterrupt
 
 
 def heeding(stop: Flag, items: Iterable[T]) -> Iterator[T]:
@@ -379,9 +382,8 @@ def draw_curve(rows: Sequence[Mapping[str, str]], file: Path) -> None:
         panel.tick_params(labelsize=7)
         if name != "loss":
             panel.legend(fontsize=6)
-    partial = file.with_name("curve.tmp.png")
-    figure.savefig(partial, dpi=110)
-    os.replace(partial, file)
+    with whole_file(file) as partial:
+        figure.savefig(partial, dpi=110, format="png")
 
 
 def _kept(value: torch.Tensor) -> torch.Tensor:

@@ -12,6 +12,12 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 T = TypeVar("T")
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM ended a training, which is saved."""
+
+
 #: scenes drawn ahead per worker
 AHEAD = 3
 

@@ -208,7 +208,15 @@ class Stream(torch.utils.data.Dataset):
     def __len__(self) -> int:
         return self.options.steps * self.options.batch
 
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor, int]:
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor, int] | OSError:
+        try:
+            return self._item(index)
+        except (
+            OSError
+        ) as error:  # handed over: one that is raised in a worker loses its file's name
+            return error
+
+    def _item(self, index: int) -> tuple[torch.Tensor, torch.Tensor, int]:
         cv2.setNumThreads(1)
         batch, seed, number = self.options.batch, self.options.seed, -1
         if self.real and index % batch < round(self.options.real_share * batch):
@@ -242,9 +250,28 @@ def batches(
     loader = torch.utils.data.DataLoader(
         Stream(options, pool, real), batch_sampler=order, num_workers=workers,
         pin_memory=options.device != "cpu", worker_init_fn=leave_interrupts_to_the_parent,
+        collate_fn=_batch,
     )  # fmt: skip
-    for x, y, numbers in loader:
-        yield [a.to(options.device, non_blocking=True) for a in (x, y)] + [numbers]
+    drawn = iter(loader)
+    try:
+        for found in drawn:
+            if isinstance(found, OSError):
+                raise found
+            x, y, numbers = found
+            yield [a.to(options.device, non_blocking=True) for a in (x, y)] + [numbers]
+        return
+    except BaseException as error:  # noqa: BLE001 - raised below
+        failed = error.with_traceback(None)
+    # The frames of a traceback hold the iterator, and it its processes, which heed no signal: they
+    # would be waited for without end.
+    del drawn
+    raise failed
+
+
+def _batch(items: list[Any]) -> Any:
+    """Return the items of a batch together, or the first error among them."""
+    failed = next((item for item in items if isinstance(item, OSError)), None)
+    return torch.utils.data.default_collate(items) if failed is None else failed
 
 
 @functools.cache

@@ -7,6 +7,7 @@ from click.testing import CliRunner
 
 from gcar_deploy.imaging.net import KIND
 from gcar_export.cli.main import main
+from gcar_export.training.scene_stream import Terminated
 
 
 def said(*words):
@@ -102,3 +103,21 @@ def test_a_segmenter_is_verified_like_a_predictor():
     assert code == 0 and "golden case: largest difference" in output
     dice = float(re.search(r"angiograms: Dice at 0\.5 (\S+) \(2 scenes\)", output)[1])
     assert dice > 0.5
+
+
+@pytest.mark.parametrize(("error", "code", "line"), [
+    (KeyboardInterrupt(), 130, "gcar-export: interrupted"),
+    (Terminated(), 143, "gcar-export: terminated"),
+    (OSError(28, "No space left on device", "/a/b"), 1,
+     "gcar-export: error: /a/b: No space left on device"),
+    (OSError(28, "No space left on device"), 1,
+     "gcar-export: error: cannot write: No space left on device"),
+    (BrokenPipeError(32, "Broken pipe"), 1, ""),
+])  # fmt: skip
+def test_what_ends_a_verb_is_one_line_and_its_exit_code(tmp_path, monkeypatch, error, code, line):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("gcar_export.training.train.start", fail)
+    ended, output = said("train", "--out", tmp_path / "run")
+    assert (ended, output.strip()) == (code, line)

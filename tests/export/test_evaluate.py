@@ -222,7 +222,7 @@ def test_evaluation_writes_tables_and_resumes(data, tmp_path, engine, monkeypatc
     for name in ("summary.json", "wilcoxon.json"):
         json.loads((tmp_path / name).read_text(), parse_constant=pytest.fail)
     assert "| ours |" in (tmp_path / "tables.md").read_text()
-    assert not list(tmp_path.glob("rows/*.partial"))
+    assert not list(tmp_path.glob("rows/*.tmp"))
     # interrupted: one row is gone, only that one is made again
     (tmp_path / "rows" / "paper-2-4-ours.json").unlink()
     counted = _counting(evaluation_engines.run_job, calls := [])

@@ -19,6 +19,7 @@ from gcar_export.training.loop import (  # noqa: E402
     learn_together,
     learning_rate,
 )
+from gcar_export.training.scene_stream import Terminated
 from gcar_export.training.run_folder import RunFolder, heeding, read_log  # noqa: E402
 from gcar_export.training.segmenter import TINY, SegmenterOptions  # noqa: E402
 
@@ -142,6 +143,10 @@ def test_what_is_learned_is_saved_before_it_is_scored(tmp_path, capsys):
     assert RunFolder(tmp_path, MANIFEST).finished(60)
 
 
+#: what a training ends with after a signal: exit codes 130 and 143
+ENDS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_ends_scoring(tmp_path, capsys, number):
     seen = []
@@ -156,8 +161,9 @@ def test_an_interrupt_ends_scoring(tmp_path, capsys, number):
     net = line()
     own = dataclasses.replace(lesson(net, steps=1), validate=validate)
     both = [(RunFolder(tmp_path / name, MANIFEST), net, own) for name in "ab"]
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as ended:
         learn_together(both, options(steps=1))
+    assert ended.type is ENDS[number]
     assert seen == [0, 1, 2]
     said = capsys.readouterr().err
     for name in "ab":
@@ -181,8 +187,9 @@ def test_an_interrupt_saves_where_it_is_and_a_second_ends_at_once(tmp_path, caps
         return dataclasses.replace(own, batches=batches)
 
     before = signal.signal(number, signal.default_int_handler)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as ended:
         learn(RunFolder(tmp_path, MANIFEST), net, options(), pressed(1))
+    assert ended.type is ENDS[number]
     assert f"{tmp_path} is saved at step 3; the same command goes on" in capsys.readouterr().err
     assert int(load_file(tmp_path / "checkpoint.safetensors")["step"]) == 3
     assert json.loads((tmp_path / "manifest.json").read_text())["step"] == 3
