@@ -67,17 +67,36 @@ def main(verbose: bool) -> None:
 
 
 @main.command()
-@click.argument("case_dirs", nargs=-1, type=FOLDER, required=True)
+@click.argument("case_dirs", nargs=-1, type=FOLDER)
+@click.option("--volume", type=FILE, help="Instead: a volume of your own, by any method.")
+@click.option("--truth", type=FILE, help="What it should be: a label volume, or shares 0 .. 1.")
 @click.option(
     "--run-option", "extra", multiple=True, help="Passed on to 'gcar run', one word each."
 )
 @click.option("--limit", type=DURATION, default=600.0, show_default=True, help="Seconds per case.")
-def score(case_dirs: tuple[Path, ...], extra: tuple[str, ...], limit: float) -> None:
-    """Score ready cases (view*.png, geom.json, truth.nii.gz) through 'gcar run'.
+def score(
+    case_dirs: tuple[Path, ...],
+    volume: Path | None,
+    truth: Path | None,
+    extra: tuple[str, ...],
+    limit: float,
+) -> None:
+    """Score ready cases (view*.png, geom.json, truth.nii.gz) through 'gcar run', or a volume.
 
-    Example: gcar-export score cases/P_0001 cases/M_0001
+    Of each case the Dice at 0.5, the best over common shifts of the tree up to 3 voxels (a patient
+    who moved between the views shows none of it), and the best over thresholds; means are of cases
+    whose names begin alike. A volume of your own has the measures of 'evaluate'.
+
+    Example: gcar-export score --volume mine.nii.gz --truth case/truth.nii.gz
     """
+    from gcar_export.evaluate import own_volume
     from gcar_export.evaluate import score as scoring
+
+    if bool(case_dirs) == bool(volume or truth) or bool(volume) != bool(truth):
+        raise UsageError("score takes folders of ready cases, or --volume with --truth")
+    if volume and truth:
+        click.echo(own_volume.table(own_volume.compare(volume, truth)))
+        return
 
     scores, wrong = [], []
     for k, folder in enumerate(case_dirs):

@@ -199,12 +199,13 @@ _DAMAGE = (
 )  # fmt: skip
 
 
-def read_label(path: str | Path) -> LabelVolume:
+def read_label(path: str | Path, *, shares: bool = False) -> LabelVolume:
     """Read a label volume by its file name: .nii, .nii.gz, .nrrd, .mha, .mhd or ASOCA .npz.
 
     Any value above 0 is vessel. Shares (floating-point values, all within 0 .. 1, not only these
     two) are vessel from ``SHARE`` on, which is said on stderr; the ``occupancy`` array of an .npz
-    (uint8, 0 .. 255) keeps its own. Wide empty borders are cropped.
+    (uint8, 0 .. 255) keeps its own, and so does every file with ``shares``. Wide empty borders are
+    cropped.
 
     Raises
     ------
@@ -224,9 +225,10 @@ def read_label(path: str | Path) -> LabelVolume:
             if array.ndim != 3:
                 raise UsageError(f"{path}: a label volume has 3 axes, this has {array.ndim}")
             _refuse_sheared(affine, path)
-            vessel = _vessel(array, path)
+            vessel = _vessel(array, path, said=not shares)
             _refuse_pictures(array, vessel, path)
-            label = from_array(vessel, affine, case)
+            kept = shares and _holds_shares(array)
+            label = from_array(array if kept else vessel, affine, case)
     except _DAMAGE as error:
         reason = (str(error).splitlines() or [""])[0].replace(str(path), "it")[:200]
         raise UsageError(f"{path}: cannot be read ({reason or type(error).__name__})") from None
@@ -293,16 +295,23 @@ def _refuse_pictures(array: Array, vessel: Array, path: Path) -> None:
         )
 
 
-def _vessel(array: Array, path: Path) -> Array:
+def _vessel(array: Array, path: Path, *, said: bool) -> Array:
     """Voxels that are vessel, bool."""
     if np.issubdtype(array.dtype, np.floating):
         if strange := int((~np.isfinite(array)).sum()):
             raise UsageError(f"{path}: {strange} voxels are no finite numbers")
-        shares = ((array > 0) & (array < 1)).any()
-        if shares and not ((array < 0) | (array > 1)).any():
-            click.echo(f"{path} holds shares 0 .. 1: from {SHARE} on a voxel is vessel", err=True)
+        if _holds_shares(array):
+            if said:
+                rule = f"from {SHARE} on a voxel is vessel"
+                click.echo(f"{path} holds shares 0 .. 1: {rule}", err=True)
             return np.asarray(array >= SHARE)
     return np.asarray(array > 0)
+
+
+def _holds_shares(array: Array) -> bool:
+    """Whether the values are shares or probabilities: broken numbers, all within 0 .. 1."""
+    within = np.issubdtype(array.dtype, np.floating) and array.min() >= 0 and array.max() <= 1
+    return bool(within and ((array > 0) & (array < 1)).any())
 
 
 def _read_any(path: Path, name: str) -> tuple[Array, Array]:

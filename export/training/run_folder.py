@@ -28,8 +28,8 @@ from safetensors.torch import save
 
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_export.scenes.whole_file import whole_file
-from gcar_export.training.scene_stream import Terminated
 from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
+from gcar_export.training.scene_stream import Terminated
 
 SCHEMA = "gcar-training/1"
 #: keys of the manifest that a resumed run must share with the run it goes on from

@@ -558,9 +558,15 @@ def test_score_reads_what_the_command_wrote(data, tmp_path, monkeypatch):
 
     monkeypatch.setattr(score.subprocess, "run", command)
     found = score.score_case(folder)
-    assert found.dsc.value == 1.0
-    assert found.best_dsc.value < 1.0
-    assert "| M_1 | 0 | ok | 100.00 |" in score.table([found])
+    # What is measured does not hang on the folder's name.
+    assert found.shifted_dsc.value == 1.0
+    assert found.dsc.value < found.best_dsc.value + 1e-9 < 1.0
+    other = score.score_case(folder.rename(tmp_path / "P_1"))
+    assert (other.dsc, other.shifted_dsc) == (found.dsc, found.shifted_dsc)
+    text = score.table([found, other])
+    assert "| case | exit | status | DSC % | DSC, common shift allowed % | best DSC % |" in text
+    assert f"| M_1 | 0 | ok | {100 * found.dsc.value:.2f} | 100.00 |" in text
+    assert f"| mean of P_* (1 cases) | | | {100 * found.dsc.value:.2f} | 100.00 |" in text
 
 
 def test_command_line_lists_its_verbs():

@@ -19,8 +19,8 @@ from gcar_export.training.loop import (  # noqa: E402
     learn_together,
     learning_rate,
 )
-from gcar_export.training.scene_stream import Terminated
 from gcar_export.training.run_folder import RunFolder, heeding, read_log  # noqa: E402
+from gcar_export.training.scene_stream import Terminated  # noqa: E402
 from gcar_export.training.segmenter import TINY, SegmenterOptions  # noqa: E402
 
 MANIFEST = {"network": "line", "config": {}, "seed": 1}
