@@ -13,7 +13,7 @@ _CASES = click.option("--cases", default="", help="Only these cases, comma-separ
 
 
 @click.command("centers-table")
-@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with label volumes.")
 @click.option(
     "--protocol",
     type=click.Choice(["paper", "clinical", "moved", "raw"]),
@@ -42,7 +42,7 @@ def centers_table(data: Path, protocol: str, models: str, cases: str, no_cost: b
 
 
 @click.command()
-@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with label volumes.")
 @_CASES
 @click.option(
     "--curves",

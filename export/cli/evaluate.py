@@ -58,7 +58,7 @@ def _list_methods(ctx: click.Context, _: click.Parameter, methods: str) -> str:
 
 
 @click.command()
-@click.option("--data", type=FOLDER, help="Folder with imagecas/, asoca/ or masks; not for thin.")
+@click.option("--data", type=FOLDER, help="Folder with label volumes; not for thin.")
 @click.option(
     "--protocol",
     type=click.Choice([*_SET_UPS, "common", "thin"]),
@@ -176,7 +176,7 @@ def evaluate(
 
 
 @click.command()
-@click.option("--data", type=FOLDER, required=True, help="Folder with imagecas/, asoca/ or masks.")
+@click.option("--data", type=FOLDER, required=True, help="Folder with label volumes.")
 @_PROTOCOL
 @click.option("--methods", default="nerp,3dgr-fbp", show_default=True, help="Comma-separated.")
 @click.option("--steps", default="25,50,100,200,400", show_default=True, help="Budgets.")

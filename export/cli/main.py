@@ -158,16 +158,17 @@ def pair_time(label: Path, repeats: int) -> None:
 
 
 @main.command("tree-table")
-@click.option("--data", type=FOLDER, help="Folder with imagecas/; left out: generated trees alone.")
+@click.option("--data", type=FOLDER, help="Folder with label volumes; without: generated trees.")
 @counted("--count", 30, "Generated trees of each style.")
 def tree_table(data: Path | None, count: int) -> None:
     """Compare generated trees with real ones, figure by figure.
 
     Example: gcar-export tree-table --data data
     """
+    from gcar_export.scenes.label_files import label_files
     from gcar_export.studies.tree_table import STYLES, generated_statistics, real_statistics, table
 
-    real = sorted((data / "imagecas").glob("*.label.nii.gz")) if data else []
+    real = label_files(data) if data else []
     columns = {}
     for style in STYLES:
         with click.progressbar(range(count), label=style, file=sys.stderr) as seeds:
@@ -176,7 +177,7 @@ def tree_table(data: Path | None, count: int) -> None:
 
 
 @main.command("lumen-table")
-@click.option("--data", type=FOLDER, help="Folder with imagecas/; left out: generated trees alone.")
+@click.option("--data", type=FOLDER, help="Folder with label volumes; without: generated trees.")
 @counted("--count", 30, "Cases, one stenosis each.", FROM_ZERO)
 @counted("--vessels", 0, "Single vessels of known area, of each kind of picture.", FROM_ZERO)
 @counted("--healthy", 0, "Generated trees without a lesion.", FROM_ZERO)
@@ -184,7 +185,7 @@ def lumen_table(data: Path | None, count: int, vessels: int, healthy: int) -> No
     """Measure stenosis, radius and branch lengths on trees with one known stenosis.
 
     Left trees, the clinical views, stenoses of 30 .. 70 % of the diameter, 8 .. 16 mm long.
-    With --vessels: round, oval and (with DATA/ivus) real lumens along centrelines of DATA/imagecas
+    With --vessels: round, oval and (with DATA/ivus) real lumens along centrelines of DATA
     or generated ones; healthy diameters of 1.2 .. 4 mm, stenoses of 30 .. 90 %, pixels of
     0.15 .. 0.4 mm, blur of 0.3 .. 0.6 mm (full width at half maximum), noise up to 0.1 mm.
     With --healthy: how many lesions of 25 % and more are seen where there is none.

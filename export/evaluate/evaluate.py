@@ -25,16 +25,12 @@ from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run
 from gcar_export.evaluate.jobs import NO_CASE, Job, case_name, row_path, write_done
 from gcar_export.methods.settings import METHODS, RUNTIME_ROWS, MethodSettings
 from gcar_export.methods.solve import check_models
+from gcar_export.scenes.label_files import label_files
 from gcar_export.scenes.labels import case_stem
 from gcar_export.scenes.protocols import COMMON, PROTOCOLS
 from gcar_export.scenes.thin_protocol import THIN, thin_names
 
 LOGGER = logging.getLogger(__name__)
-#: where label volumes are looked for below the data folder, in this order.
-LABEL_PATTERNS = (
-    "imagecas/*.label.nii.gz", "asoca/*.npz", "asoca/*.nrrd",
-    "*.label.nii.gz", "*.nii.gz", "*.nrrd", "*.mha",
-)  # fmt: skip
 #: protocols that one word asks for
 GROUPS: Mapping[str, tuple[str, ...]] = {"common": tuple(COMMON), "thin": tuple(THIN)}
 #: what to do with rows that were made with other settings or label files.
@@ -114,7 +110,7 @@ class EvaluateOptions:
 
 
 def find_labels(data: Path, cases: Sequence[str] = ()) -> list[Path]:
-    """Label volumes below a folder: ImageCAS, ASOCA, or any mask lying in it.
+    """Label volumes of a folder, as ``label_files`` finds them, of the cases that are asked for.
 
     Parameters
     ----------
@@ -126,14 +122,7 @@ def find_labels(data: Path, cases: Sequence[str] = ()) -> list[Path]:
     UsageError
         There are none, a case is not among them, or two files have the name of one case.
     """
-    found: dict[Path, None] = {}
-    for folder in (data, data / "data"):
-        for pattern in LABEL_PATTERNS:
-            for path in sorted(folder.glob(pattern)):
-                found.setdefault(path.resolve())
-        if found:
-            return _chosen(list(found), cases, data)
-    raise UsageError(f"no label volume in {data} ({', '.join(LABEL_PATTERNS)})")
+    return _chosen(label_files(data, arrays=True), cases, data)
 
 
 def evaluate(

@@ -18,12 +18,12 @@ from gcar_deploy.errors import UsageError
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.measure.metrics import skeleton
 from gcar_export.scenes.capsules import Capsules, LabelTree
+from gcar_export.scenes.label_files import label_files
 from gcar_export.scenes.labels import LabelVolume, read_label
 from gcar_export.scenes.render import occupancy
 
 #: label volumes are thinned at this voxel edge, mm
 VOXEL_MM = 0.5
-SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 #: radii that the predictors are made for, mm
 RADIUS_RANGE_MM = (0.4, 3.4)
 
@@ -40,9 +40,7 @@ def read_label_trees(folder: Path) -> tuple[list[LabelTree], dict[str, str]]:
     UsageError
         None is there, or one cannot be read.
     """
-    files = sorted(p for p in folder.iterdir() if p.name.lower().endswith(SUFFIXES))
-    if not files:
-        raise UsageError(f"{folder} holds no label volume ({', '.join(SUFFIXES)})")
+    files = label_files(folder)
     trees = [_tree_of(file) for file in files]
     return trees, {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 

@@ -12,9 +12,10 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
-from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.errors import GcarError
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.tree.tree import Tree, along
+from gcar_export.scenes.label_files import label_files
 from gcar_export.scenes.labels import case_stem
 from gcar_export.scenes.stenosis_cases import (
     StenosisCase,
@@ -64,7 +65,7 @@ def lumen_rows(
 
     Parameters
     ----------
-    data : folder with ``imagecas/*.label.nii.gz``; None takes generated trees
+    data : folder with label volumes (``label_files``); None takes generated trees
     count : cases; of label volumes as many stenoses a tree as it takes
 
     Raises
@@ -73,9 +74,7 @@ def lumen_rows(
         There is no label volume.
     """
     engine = Engine()
-    labels = sorted((data / "imagecas").glob("*.label.nii.gz")) if data else []
-    if data and not labels:
-        raise UsageError(f"{data} holds no imagecas/*.label.nii.gz")
+    labels = label_files(data) if data else []
     trees = {path: label_tubes(path) for path in labels}
     rows = []
     for k in range(count):

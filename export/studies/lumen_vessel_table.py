@@ -16,6 +16,7 @@ from gcar_deploy.measure.lesions import LESION_SHARE
 from gcar_deploy.measure.lumen import BranchLumen
 from gcar_deploy.result import Result
 from gcar_deploy.tree.tree import along
+from gcar_export.scenes.label_files import label_files
 from gcar_export.scenes.lumen_vessels import LumenCase, ivus_shapes, lumen_case, taken
 from gcar_export.scenes.stenosis_cases import (
     Lesion,
@@ -72,7 +73,7 @@ def vessel_rows(
 
 def _lines(data: Path | None) -> list[np.ndarray]:
     """Centrelines: of label volumes where there are some, else generated."""
-    found = sorted((data / "imagecas").glob("*.label.nii.gz"))[:VOLUMES] if data else []
+    found = label_files(data)[:VOLUMES] if data else []
     tubes = [tube for path in found for tube in label_tubes(path)]
     tubes = tubes or [tube for k in range(4) for tube in generated_tubes(9_200_000 + k)]
     return [tube.points_mm for tube in tubes if tube.arc_mm[-1] >= LEAST_MM]
