@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from gcar_deploy.errors import UsageError
 from gcar_export.cli.options import COUNT, FILE, FOLDER, OUT_FOLDER, counted
+
+if TYPE_CHECKING:
+    from gcar_export.evaluate.evaluate import EvaluateOptions
 
 _SET_UPS = ["paper", "clinical", "moved", "raw"]
 _PROTOCOL = click.option(
@@ -100,7 +104,11 @@ def _list_methods(ctx: click.Context, _: click.Parameter, methods: str) -> str:
     help="Rows in --out that were made with other settings or label files.",
 )
 @click.option("--redo", default="", help="Make the rows of these methods anew in any case.")
-@click.option("--draw-only", is_flag=True, help="Tables and pictures anew from --out/cases.csv.")
+@click.option(
+    "--draw-only",
+    is_flag=True,
+    help="Tables and pictures anew from --out/cases.csv, of what is named.",
+)
 @click.option("--quiet", is_flag=True, help="No progress on stderr.")
 def evaluate(
     data: Path | None,
@@ -153,7 +161,9 @@ def evaluate(
     )
     reference = options.methods[0]
     if draw_only:
-        rows = evaluation_tables.read_case_rows(out / "cases.csv")
+        rows = _asked(evaluation_tables.read_case_rows(out / "cases.csv"), options)
+        methods_there = [row["method"] for row in rows]
+        reference = reference if reference in methods_there else methods_there[0]
         evaluation.write_summaries(rows, out, reference)
     else:
         progress = _Progress(quiet=quiet)
@@ -167,6 +177,9 @@ def evaluate(
     click.echo(evaluation_tables.markdown(rows, reference))
     click.echo(peers.beside_peers(rows))
     click.echo(draw(rows, out, reference))
+    left_out = "" if draw_only else evaluation.beside(options, rows)
+    if left_out:
+        click.echo(left_out, err=True)
     lost = evaluation.without_case(rows)
     if lost:
         count = len({row["case"] for row in rows})
@@ -257,6 +270,37 @@ def paper_page(
     (out / "paper.md").write_text(text + "\n", encoding="utf-8")
     click.echo(text)
     click.echo(study.draw(rows, out))
+
+
+def _asked(rows: list[dict[str, Any]], options: EvaluateOptions) -> list[dict[str, Any]]:
+    """Return the rows that options on the command line name; all where none does.
+
+    Raises
+    ------
+    UsageError
+        There are none.
+    """
+    ctx = click.get_current_context()
+    wanted: dict[str, tuple[str, Any]] = {
+        "method": ("methods", options.methods),
+        "case": ("cases", options.cases),
+        "views": ("views", options.views),
+        "protocol": ("protocol", options.protocols),
+    }
+    for key, (option, values) in wanted.items():
+        if ctx.get_parameter_source(option) is not ParameterSource.COMMANDLINE:
+            continue
+        there = dict.fromkeys(row[key] for row in rows)
+        lacking = [str(value) for value in values if value not in there]
+        if lacking:
+            raise UsageError(
+                f"{option} {', '.join(lacking)}: {options.out / 'cases.csv'} holds no such row "
+                f"but of {', '.join(map(str, there))}; run without --draw-only"
+            )
+        rows = [row for row in rows if row[key] in values]
+    if not rows:
+        raise UsageError(f"{options.out / 'cases.csv'} holds no row of all these")
+    return rows
 
 
 def _absolute(path: Path | None) -> Path | None:

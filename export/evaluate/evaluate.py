@@ -37,6 +37,10 @@ GROUPS: Mapping[str, tuple[str, ...]] = {"common": tuple(COMMON), "thin": tuple(
 CHANGED = ("redo", "keep", "refuse")
 #: what a row is tied to, in words
 _TIED = ("settings", "label files")
+#: what a row's file is named by
+_KEYS = ("protocol", "case", "views", "method")
+#: what a row has in every version
+_NEEDED = {*_KEYS, "dataset", "status", "measures", "stages"}
 OnProgress = Callable[[int, int, str], None]
 
 
@@ -214,6 +218,25 @@ def _check_own(options: EvaluateOptions) -> None:
         )
 
 
+def beside(options: EvaluateOptions, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Say which finished rows in ``options.out`` are not among ``rows``; empty where all are."""
+    shown = {"-".join(str(row[key]) for key in _KEYS) for row in rows}
+    others, count = [], 0
+    for path in (options.out / "rows").glob("*.json"):
+        if path.stem not in shown:
+            count += 1
+            with contextlib.suppress(ValueError):
+                others.append(_read(path))
+    if not count:
+        return ""
+    new = {k: sorted({str(r[k]) for r in others} - {str(r[k]) for r in rows}) for k in _KEYS}
+    told = "; ".join(f"{key} {', '.join(names)}" for key, names in new.items() if names)
+    return (
+        f"{count} finished rows in {options.out / 'rows'} are not in these tables"
+        f"{told and f' ({told})'}: name all that belong together, finished rows are kept"
+    )
+
+
 def without_case(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return the cases that could not be made in any of their rows, each with the reason."""
     made = {row["case"] for row in rows if row["status"] != NO_CASE}
@@ -248,7 +271,12 @@ def _missing(jobs: Sequence[Job], options: EvaluateOptions) -> list[Job]:
         if not path.exists() or job.method in options.redo:
             missing.append(job)
             continue
-        row = _read(path)
+        try:
+            row = _read(path)
+        except ValueError:
+            LOGGER.warning("%s is damaged: made again", path)
+            missing.append(job)
+            continue
         same = (row.get("settings") == job.digest, row.get("label_sha256") == job.data)
         if not all(same):
             changed.append(job)
@@ -299,7 +327,16 @@ def _sha256(path: Path) -> str:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    row: dict[str, Any] = json.loads(path.read_text())
+    """Read a row back.
+
+    Raises
+    ------
+    ValueError
+        It is damaged.
+    """
+    row: Any = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(row, dict) or not row.keys() >= _NEEDED:
+        raise ValueError(path)
     return row
 
 
