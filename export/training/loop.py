@@ -12,7 +12,7 @@ import click
 import torch
 
 from gcar_export.training.mean_weights import MeanWeights
-from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, until_interrupted
+from gcar_export.training.run_folder import Flag, ProgressLine, RunFolder, alone, until_interrupted
 
 N = TypeVar("N", bound=torch.nn.Module)
 B = TypeVar("B")
@@ -123,7 +123,7 @@ def learn_together(
     step = min(run.step for run in runs)
     line = ProgressLine(step, options.steps, options.batch, "pictures")
     began = time.monotonic()
-    with until_interrupted() as stop:
+    with alone([folder for folder, _, _ in pupils]), until_interrupted() as stop:
         for batch in pupils[0][2].batches(step):
             if stop.is_set() or (minutes is not None and time.monotonic() - began > 60 * minutes):
                 break
@@ -143,7 +143,7 @@ def learn_together(
             for run in runs:
                 run.score(stop)
         finally:
-            if stop.is_set():
+            if stop.is_set() or step < options.steps:
                 for run in runs:
                     run.folder.interrupt(run.step)
 
@@ -187,3 +187,5 @@ class _Run(Generic[N, B]):
         click.echo(f"{self.folder.path} is saved at step {self.step}; it is scored now", err=True)
         scores = self.lesson.validate(self.mean.net, stop)
         self.folder.log(self.step, {"all": scores}, scores)
+        told = ", ".join(f"{name} {value:.3f}" for name, value in scores.items())
+        click.echo(f"{self.folder.path} at step {self.step}: {told} (held out)", err=True)

@@ -36,6 +36,7 @@ from gcar_export.training.run_folder import (
     Flag,
     ProgressLine,
     RunFolder,
+    alone,
     heeding,
     until_interrupted,
 )
@@ -209,11 +210,12 @@ def train(
         out, options, config or SparseConfig(), until, tuple(labels), dict(label_hashes or {}),
         warm_start,
     )  # fmt: skip
-    if _run_folder(job).finished(options.steps):
+    run = _run_folder(job)
+    if run.finished(options.steps):
         return
     # One process asks the flag that its own signal raises: a shared one, which locks, would hang.
     shared = torch.multiprocessing.get_context("spawn").Event() if options.replicas > 1 else None
-    with until_interrupted(shared) as stop:
+    with alone([run]), until_interrupted(shared) as stop:
         _replicas(job, stop)
 
 
@@ -324,7 +326,7 @@ def _replica(rank: int, job: _Job, stop: Flag) -> None:
             save_and_score()
     if rank == 0:
         run.save(net, optimiser, step, mean=mean.net)
-        if stop.is_set():
+        if step < options.steps or stop.is_set():
             run.interrupt(step)
     if options.replicas > 1:
         torch.distributed.destroy_process_group()

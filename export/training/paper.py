@@ -28,6 +28,7 @@ from gcar_export.training.run_folder import (
     Flag,
     ProgressLine,
     RunFolder,
+    alone,
     heeding,
     until_interrupted,
 )
@@ -224,7 +225,7 @@ def train(
     """
     run = RunFolder(out, _manifest(options, config, label_hashes or {}))
     if not run.finished(options.steps):
-        with until_interrupted() as stop:
+        with alone([run]), until_interrupted() as stop:
             _train(run, options, config, until, labels, stop)
 
 
@@ -293,7 +294,7 @@ def _train(
         line.show(step, run.losses)
         save_and_score()
     run.save(net, optimiser, step, {"skipped_steps": skipped})
-    if stop.is_set():
+    if step < options.steps or stop.is_set():
         run.interrupt(step)
 
 

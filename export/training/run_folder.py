@@ -26,9 +26,11 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
+from gcar_deploy.batch.lock import only_batch
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_export.scenes.whole_file import whole_file
 from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
+from gcar_export.training.run_log import draw_curve, read_log
 from gcar_export.training.scene_stream import Terminated
 
 SCHEMA = "gcar-training/1"
@@ -109,7 +111,8 @@ class RunFolder:
         if self.checkpoint.is_file():
             self.manifest |= {key: before[key] for key in _KEPT if key in before}
             # Weights are saved before they are scored: a row says that they were.
-            self._scored = max((int(r["step"]) for r in read_log(self._log)), default=-1)
+            rows = read_log(self._log)
+            self._scored = max((int(r["step"]) for r in rows), default=-1)
 
     def took(self, loss: float) -> None:
         """Keep the loss of a step for the mean; one that is not finite has none."""
@@ -121,11 +124,35 @@ class RunFolder:
         return self._scored >= step
 
     def finished(self, steps: int) -> bool:
-        """Whether all steps were taken and scored before; says so."""
+        """Whether all steps were taken and scored before; says so, and what does not fit."""
+        self._say_what_is_odd()
         done = self._scored >= steps
         if done:
             click.echo(f"{self.path} is finished: {self._scored} steps", err=True)
         return done
+
+    def _say_what_is_odd(self) -> None:
+        """Say where checkpoint, manifest and log are not of one run, or not of one step."""
+        manifest = self.path / "manifest.json"
+        if not manifest.is_file():
+            return
+        if not self.checkpoint.is_file():
+            beside = " and log.csv" if self._log.is_file() else ""
+            click.echo(
+                f"{self.path} has manifest.json{beside} but no {self.checkpoint.name}: begins anew",
+                err=True,
+            )
+            return
+        said = json.loads(manifest.read_text(encoding="utf-8")).get("step")
+        step = int(read_tensors(self.checkpoint).get("step", torch.tensor(-1)))
+        if said != step:
+            click.echo(
+                f"{self.checkpoint} is of step {step}, its manifest.json of step {said}: what the "
+                "checkpoint holds counts",
+                err=True,
+            )
+        # A log of another run, or of weights that are gone, scores nothing of these.
+        self._scored = min(self._scored, step)
 
     def resume(
         self,
@@ -237,6 +264,28 @@ class RunFolder:
                 writer.writerow({"step": step, "loss": f"{loss:.4f}", "kind": kind, **shown})
         self._scored = step
         draw_curve(read_log(file), self.path / "curve.png")
+
+
+def alone(folders: Sequence[RunFolder]) -> contextlib.ExitStack:
+    """Hold the folders of a training, each by a lock that the system takes away with the process.
+
+    What a training that was killed there left half written goes.
+
+    Raises
+    ------
+    UsageError
+        Another training is at work in one.
+    """
+    stack = contextlib.ExitStack()
+    for folder in folders:
+        try:
+            stack.enter_context(only_batch(folder.path, folder.path / "run.lock"))
+        except UsageError as error:
+            stack.close()
+            raise UsageError(str(error).replace("another batch", "another training", 1)) from None
+        for partial in folder.path.glob("*.tmp"):
+            partial.unlink(missing_ok=True)
+    return stack
 
 
 def check_device(device: str) -> None:
@@ -351,39 +400,6 @@ class ProgressLine:
 def load_weights(net: torch.nn.Module, data: Mapping[str, torch.Tensor]) -> None:
     """Put the ``net.`` entries of a checkpoint into a network."""
     net.load_state_dict(weights(data))
-
-
-def read_log(file: Path) -> list[dict[str, str]]:
-    """Rows of a log.csv; none where there is no file."""
-    if not file.is_file():
-        return []
-    with file.open(newline="", encoding="utf-8") as f:
-        return list(csv.DictReader(f))
-
-
-def draw_curve(rows: Sequence[Mapping[str, str]], file: Path) -> None:
-    """Draw loss and every measure over the steps, one panel each, one line per kind."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    if not rows:
-        return
-    names = [name for name in rows[0] if name not in ("step", "kind")]
-    figure = Figure(figsize=(3.2 * len(names), 2.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    for k, name in enumerate(names):
-        panel = figure.add_subplot(1, len(names), k + 1)
-        for kind in sorted({r["kind"] for r in rows}) if name != "loss" else [rows[0]["kind"]]:
-            own = [r for r in rows if r["kind"] == kind]
-            steps = [int(r["step"]) for r in own]
-            panel.plot(steps, [float(r[name]) for r in own], label=kind, linewidth=1.2)
-        panel.set_title(name, fontsize=9)
-        panel.set_xlabel("step", fontsize=8)
-        panel.tick_params(labelsize=7)
-        if name != "loss":
-            panel.legend(fontsize=6)
-    with whole_file(file) as partial:
-        figure.savefig(partial, dpi=110, format="png")
 
 
 def _kept(value: torch.Tensor) -> torch.Tensor:

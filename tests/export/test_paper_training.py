@@ -195,6 +195,7 @@ def test_training_resumes_to_the_bit(tmp_path):
     names = {f.name for f in (tmp_path / "whole").iterdir()}
     assert names == {
         "checkpoint.safetensors", "best.safetensors", "manifest.json", "log.csv", "curve.png",
+        "run.lock",
     }  # fmt: skip
     best = [read_manifest(tmp_path / k / "best.safetensors")["best"] for k in ("whole", "parts")]
     assert best[0]["step"] == best[1]["step"] in (2, 4)
