@@ -187,6 +187,7 @@ def export_segmenter(
             net,
             (example, points, near),
             dynamo=True,
+            verbose=False,
             opset_version=OPSET,
             external_data=False,
             input_names=list(INPUTS),
@@ -199,7 +200,8 @@ def export_segmenter(
     # Of a run that was cut off here; it would be refused with another model.
     golden_path(partial).unlink(missing_ok=True)
     try:
-        _write(program, partial)
+        with quiet_tracing():
+            _write(program, partial)
         training = _training(checkpoint, devices)
         _write_spec(training, partial, out.stem, net)
         worst = _largest_difference(net, partial, pictures)

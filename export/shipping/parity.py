@@ -170,13 +170,16 @@ def export_checked(checkpoint: Path, out: Path, inputs: int = 60, task_scenes: i
 def accept(name: str, found: Parity) -> None:
     """Raise ModelError unless the comparison shows one and the same network."""
     # Not "worse than": a comparison with NaN is false.
-    if not (found.worst <= PARITY and found.decisions_equal >= DECISIONS):
-        raise ModelError(
-            f"{name} differs from its checkpoint by {found.worst:.1e} of the range "
-            f"(at most {PARITY:g}); {found.decisions_equal:.4%} of decisions equal"
-        )
+    failed = []
+    if not found.worst <= PARITY:
+        failed.append(f"by {found.worst:.1e} of the range (at most {PARITY:g})")
+    if not found.decisions_equal >= DECISIONS:
+        equal = f"{found.decisions_equal:.4%} of them are equal"
+        failed.append(f"in its decisions: {equal} (at least {DECISIONS:.2%})")
+    if failed:
+        raise ModelError(f"{name} differs from its checkpoint {' and '.join(failed)}")
     if abs(found.task_torch - found.task_runtime) > TASK:
         raise ModelError(
             f"{name} reaches {found.task_runtime:.4f} through the runtime's own predictor, its "
-            f"checkpoint {found.task_torch:.4f}"
+            f"checkpoint {found.task_torch:.4f}: more than {TASK:g} apart"
         )

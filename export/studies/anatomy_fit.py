@@ -24,6 +24,7 @@ from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array, Points, Scalars
 from gcar_export.scenes.gantry import random_rotation
 from gcar_export.scenes.trees import SyntheticTree, random_tree, rough_style, thin_style
+from gcar_export.studies.command import ended
 
 FIT_SEED, LINE_SEED, CHECK_SEED = 71_001, 71_002, 71_003
 SIDES = ("left", "right", "whole")
@@ -180,4 +181,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

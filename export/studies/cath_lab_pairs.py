@@ -30,7 +30,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.tree.curves import resample
 from gcar_deploy.types import Array, Points
 from gcar_export.scenes.cine import CinePair, CineRun, cine_pair
-from gcar_export.studies.command import arguments, print_table
+from gcar_export.studies.command import arguments, ended, print_table
 from gcar_export.studies.pair_rows import Judged, table_by_name
 
 SEED, FRAMES = 7_400, 8
@@ -150,4 +150,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

@@ -9,7 +9,23 @@ from typing import TypeVar
 
 import click
 
+from gcar_deploy.errors import GcarError
+
 Row = TypeVar("Row")
+
+
+def ended(main: Callable[[], int | None]) -> int:
+    """Run the command of a study; return its exit code. What is wrong is one line on stderr."""
+    try:
+        return main() or 0
+    except GcarError as error:
+        click.echo(f"error: {error}", err=True)
+        return error.exit_code
+    except OSError as error:
+        click.echo(
+            f"error: {error.filename or 'cannot write'}: {error.strerror or error}", err=True
+        )
+        return 1
 
 
 def arguments(text: str | None, option: str, count: int, seed: int) -> argparse.ArgumentParser:

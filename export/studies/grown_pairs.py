@@ -24,7 +24,7 @@ from gcar_export.scenes.grown_trees import grown_tree
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.thorax import exposure
 from gcar_export.scenes.trees import SyntheticTree
-from gcar_export.studies.command import arguments, print_table
+from gcar_export.studies.command import arguments, ended, print_table
 from gcar_export.studies.pair_rows import Judged, judge, table_by_name
 
 SEED, NEAR_MM = 28_111, 1.5
@@ -122,4 +122,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

@@ -24,7 +24,7 @@ from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import any_style, random_tree
-from gcar_export.studies.command import arguments, print_table
+from gcar_export.studies.command import arguments, ended, print_table
 from gcar_export.studies.pair_rows import Judged, judge, table_by_name
 from gcar_export.studies.wrong_scenes import SIDES
 
@@ -88,4 +88,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

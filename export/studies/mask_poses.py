@@ -19,6 +19,7 @@ from gcar_deploy.pose.pairwise import estimate_poses
 from gcar_export.scenes.gantry import clinical_views
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import SIDES, random_tree, rough_style, thin_style
+from gcar_export.studies.command import ended
 
 SEED = 74_001
 #: standard deviation of the patient's shift along each axis, mm, and pixel of the masks
@@ -71,4 +72,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

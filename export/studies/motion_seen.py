@@ -30,6 +30,7 @@ from gcar_deploy.types import Points
 from gcar_export.scenes.gantry import Field, clinical_views, focused
 from gcar_export.scenes.motion import heart_motion, moved_tree
 from gcar_export.scenes.trees import SIDES, random_tree, rough_style
+from gcar_export.studies.command import ended
 from gcar_export.studies.motion_table import picture_of_tree
 
 SEED, LEVELS_MM = 91_002, (0.0, 1.0, 2.0, 3.0, 4.0, 6.0)
@@ -117,4 +118,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

@@ -42,6 +42,7 @@ from gcar_export.scenes.motion import heart_motion, moved_tree
 from gcar_export.scenes.protocols import MM_PER_COUNT, case_geometry
 from gcar_export.scenes.render import occupancy, path_lengths
 from gcar_export.scenes.trees import SIDES, SyntheticTree, random_tree, rough_style
+from gcar_export.studies.command import ended
 from gcar_export.studies.pose_table import aligned, chamfer_mm
 from gcar_export.studies.wrong_scenes import SPREAD_DEG, picture_of
 
@@ -284,4 +285,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

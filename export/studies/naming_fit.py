@@ -23,6 +23,7 @@ from gcar_deploy.measure.naming import (
     read_anatomy,
     readings,
 )
+from gcar_export.studies.command import ended
 from gcar_export.studies.naming_cases import (
     KINDS,
     NAMES,
@@ -239,4 +240,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

@@ -19,7 +19,7 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.types import Array
 from gcar_export.scenes.protocols import MM_PER_COUNT, clinical_geometry
-from gcar_export.studies.command import print_table
+from gcar_export.studies.command import ended, print_table
 from gcar_export.studies.pair_rows import judge
 from gcar_export.studies.wrong_scenes import Exam, exam
 
@@ -132,4 +132,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

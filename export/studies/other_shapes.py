@@ -26,7 +26,7 @@ from gcar_export.scenes.protocols import MASK_PATH_MM
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.shapes import SHAPES, shape
-from gcar_export.studies.command import arguments, print_table
+from gcar_export.studies.command import arguments, ended, print_table
 from gcar_export.studies.pair_rows import Judged, head, judge, row
 
 SEED = 5
@@ -128,4 +128,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

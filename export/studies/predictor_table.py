@@ -23,6 +23,7 @@ from gcar_deploy.predict.decision import decide
 from gcar_deploy.predict.kinds import MULTI
 from gcar_deploy.types import Array
 from gcar_export.scenes.pictures import PATH_ERRORS
+from gcar_export.studies.command import ended
 from gcar_export.training.dataset import TrainingScene, training_scene
 from gcar_export.training.examinations import REGIMES, SceneOptions
 
@@ -123,4 +124,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

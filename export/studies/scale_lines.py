@@ -25,6 +25,7 @@ from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.stenosis_cases import Tube
 from gcar_export.scenes.trees import SIDES, random_tree, rough_style, thin_style
 from gcar_export.scenes.true_trees import joined_tree
+from gcar_export.studies.command import ended
 
 SEED = 73_001
 BLURS_PX = (0.0, 0.5, 1.0)
@@ -84,4 +85,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

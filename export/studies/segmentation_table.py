@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from gcar_deploy.config import ImagingOptions, SegmenterName
-from gcar_deploy.errors import ModelError, RefusedError
+from gcar_deploy.errors import ModelError, RefusedError, UsageError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import DEFAULT_FIELD_MM, Angiogram, VesselImage
@@ -35,6 +35,7 @@ from gcar_deploy.types import Image, Mask
 from gcar_export.scenes.expert_pictures import expert_mask, fold_edges
 from gcar_export.scenes.sanity_pictures import EACH, sanity_picture
 from gcar_export.studies import segmentation_time
+from gcar_export.studies.command import ended
 from gcar_export.studies.segmentation_page import write_page
 
 #: truth of the R_ cases: rays that cross at least this much vessel
@@ -65,6 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     nets = [network(path) for path in chosen.model or [None]]
     cv2.setNumThreads(1)
     pairs = sorted(find(chosen.data, "xca_masks").glob("*_gt.png"), key=_number)
+    cases = find(chosen.data, "cases")
+    if not pairs and not cases.is_dir():
+        raise UsageError(f"{chosen.data} holds neither xca_masks/N.png with N_gt.png nor cases/")
     asked = Asked(chosen.segmenter, tuple(nets), chosen.pixel_mm)
     rows: dict[str, dict[str, float]] = {}
     seen = []
@@ -77,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.page:
         click.echo(write_page(seen, chosen.page))
     if len(nets) == 1:
-        _print_cases(find(chosen.data, "cases"), nets[0], asked.who)
+        _print_cases(cases, nets[0], asked.who)
         _print_generated(nets[0], asked.who)
         _print_catheters(nets[0], asked.who)
         print("\nTime of one picture (median, in turns)")
@@ -282,4 +286,4 @@ def _line(label: str, scores: dict[str, float]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(ended(main))

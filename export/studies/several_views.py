@@ -31,7 +31,7 @@ from gcar_export.scenes.protocols import clinical_geometry
 from gcar_export.scenes.raw_pictures import random_options, raw_picture
 from gcar_export.scenes.render import path_lengths
 from gcar_export.scenes.trees import SyntheticTree, any_style, random_tree
-from gcar_export.studies.command import arguments, print_table
+from gcar_export.studies.command import arguments, ended, print_table
 from gcar_export.studies.hard_raw import NEAR_MM, SPREAD_DEG
 from gcar_export.studies.pair_rows import Judged, head, row, shares
 from gcar_export.studies.wrong_scenes import SIDES
@@ -129,4 +129,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(ended(main))

@@ -102,9 +102,18 @@ def test_a_graph_that_differs_leaves_no_file(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("found", "words"),
     [
-        (Parity(60, 2e-4, 1.0, 0.7, 0.7), "by 2.0e-04 of the range"),
-        (Parity(60, 1e-6, 0.9998, 0.7, 0.7), "99.9800% of decisions equal"),
-        (Parity(60, 1e-6, 1.0, 0.7, 0.69), "reaches 0.6900 through the runtime"),
+        (
+            Parity(60, 2e-4, 1.0, 0.7, 0.7),
+            r"checkpoint by 2.0e-04 of the range \(at most 0.0001\)$",
+        ),
+        (
+            Parity(60, 1e-6, 0.9998, 0.7, 0.7),
+            r"checkpoint in its decisions: 99.9800% of them are equal \(at least 99.99%\)$",
+        ),
+        (
+            Parity(60, 1e-6, 1.0, 0.7, 0.69),
+            "reaches 0.6900 through the runtime.*0.7000: more than 0.001 apart",
+        ),
         (Parity(60, float("nan"), 1.0, 0.7, 0.7), "differs"),
     ],
 )
