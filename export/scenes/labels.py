@@ -215,6 +215,8 @@ def read_label(path: str | Path, *, shares: bool = False) -> LabelVolume:
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"no such label volume: {path}")
+    if not path.stat().st_size:
+        raise UsageError(f"{path}: the file is empty")
     name = path.name.lower()
     case = case_stem(path)
     try:
@@ -319,7 +321,9 @@ def _read_any(path: Path, name: str) -> tuple[Array, Array]:
         import nibabel
 
         image: Any = nibabel.load(path)
-        return np.asarray(image.dataobj), np.asarray(image.affine)
+        # Headers that name no unit mean mm.
+        mm = {"meter": 1000.0, "micron": 0.001}.get(image.header.get_xyzt_units()[0], 1.0)
+        return np.asarray(image.dataobj), np.diag([mm, mm, mm, 1.0]) @ np.asarray(image.affine)
     if name.endswith((".nrrd", ".nhdr")):
         return read_nrrd(path)
     if name.endswith((".mha", ".mhd")):

@@ -107,6 +107,7 @@ class RunFolder:
                 raise UsageError(
                     f"{self.path} holds a run with {_shown(key, was)}, this one has "
                     f"{_shown(key, wanted)}; give another --out, or the same {key}"
+                    f"{' (what is not given is that of --preset)' if key in new else ''}"
                 )
         if self.checkpoint.is_file():
             self.manifest |= {key: before[key] for key in _KEPT if key in before}

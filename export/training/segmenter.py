@@ -305,7 +305,9 @@ def real_pictures(real: str, fold: tuple[int, int]) -> tuple[ExpertPicture, ...]
     number, of = fold
     if (number, of) == (0, 0):
         return expert_pictures(Path(real)) if real else ()
-    if not (real and of >= 2 and 1 <= number <= of):
+    if not real:
+        raise UsageError(f"fold {number}/{of} is of real pictures: give --real, the folder of all")
+    if not (of >= 2 and 1 <= number <= of):
         raise UsageError(f"fold {number}/{of}: must be 1/n .. n/n (n >= 2) of real pictures")
     return folds(expert_pictures(Path(real)), number, of)[0]
 

@@ -244,3 +244,21 @@ def test_asoca_case():
         middle = np.argwhere(tree.occupancy >= 0.5).astype(float)
         begins.append(tree.grid.index2world(index).mean(0) - tree.grid.index2world(middle).mean(0))
     assert begins[0][0] < 0 < begins[0][1] and begins[0][2] > 0 and begins[1][2] > 0
+
+
+@pytest.mark.parametrize(("unit", "mm"), [("meter", 1000.0), ("micron", 0.001), ("mm", 1.0)])
+def test_the_unit_of_a_header_counts(tmp_path, unit, mm):
+    volume = np.zeros((20, 20, 20), np.uint8)
+    volume[5:15, 9:11, 9:11] = 1
+    image = nibabel.Nifti1Image(volume, np.diag([-0.5 / mm, -0.5 / mm, 0.5 / mm, 1]))
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    label = read_label(tmp_path / "a.nii.gz")
+    assert label.grid.spacing_mm == pytest.approx([0.5] * 3)
+    assert label.volume_mm3 == pytest.approx(40 * 0.125)
+
+
+def test_an_empty_file_is_said_to_be_one(tmp_path):
+    (tmp_path / "a.nii.gz").touch()
+    with pytest.raises(UsageError, match=r"a\.nii\.gz: the file is empty$"):
+        read_label(tmp_path / "a.nii.gz")

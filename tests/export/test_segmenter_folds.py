@@ -79,6 +79,8 @@ def test_what_is_no_fold(drawn):
     for fold in ((0, 3), (4, 3), (1, 1)):
         with pytest.raises(UsageError, match="fold"):
             real_pictures(options.real, fold)
+    with pytest.raises(UsageError, match="fold 1/3 is of real pictures: give --real"):
+        real_pictures("", (1, 3))
     with pytest.raises(UsageError, match="must be K/N"):
         chosen("cpu", {"fold": "first"})
     with pytest.raises(ImageError, match=r"no N\.png"):
