@@ -113,6 +113,21 @@ def test_a_loop_is_cut_where_the_old_way_ran():
     assert cKDTree(after.points()).query(np.array(bow))[0].max() < 1.2
 
 
+def test_of_a_loop_the_new_way_stays():
+    """Two ways that share no line do not change sides together; no tree has both."""
+    lower = _line((0, 0, -20), (0, 0, -40))
+    bow = [(0, 6 * np.sin(t), -20 * t / np.pi) for t in np.linspace(0, np.pi, 40)]
+    straight = _line((0, 0, 0), (0, 0, -20))
+    nets = (
+        Net.of(_vessels(np.concatenate([STEM, straight[1:], lower[1:]]))),
+        Net.of(_vessels(np.concatenate([STEM, bow[1:], lower[1:]]))),
+    )
+    (came,) = (one for one in differences(*nets, two_views()) if not one.old.any())
+    after = combined(*nets, came)
+    assert len(after.branches) == 1
+    assert cKDTree(after.points()).query(np.array(bow))[0].max() < 1.2
+
+
 @pytest.mark.parametrize("side", [0, 1])
 def test_nothing_beside_a_tree_is_taken_whole(side):
     pair = [_vessels(STEM, LEFT), empty_tree()]

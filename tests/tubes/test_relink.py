@@ -1,8 +1,11 @@
 """Trees of ways beside the tree that was found, and the best of all."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from skimage.morphology import skeletonize
 
 from gcar_deploy.config import TubeOptions
 from gcar_deploy.tree.edit import with_branch
@@ -58,7 +61,11 @@ def test_a_right_tree_stays_as_it_is():
 def test_paths_that_are_estimates_say_too_little():
     carms = two_views()
     truth, wrong = _along_a_ray(carms[0], 9.0)
-    now, found = _tried(wrong, seen(truth, carms, calibrated=False), wrong)
+    views = [
+        dataclasses.replace(view, skeleton=skeletonize(view.mask))
+        for view in seen(truth, carms, calibrated=False)
+    ]
+    now, found = _tried(wrong, views, wrong)
     assert found is now
 
 
