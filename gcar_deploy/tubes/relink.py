@@ -7,6 +7,7 @@ From the best of them on, each place where another tree differs is tried with it
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import cv2
@@ -16,12 +17,12 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.tree.combine import Difference, Net, combined, differences
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes.exchange import costs
-from gcar_deploy.tubes.line_pairs import line_pairs
+from gcar_deploy.tubes.line_pairs import LinePairs, line_pairs
 from gcar_deploy.tubes.proposal import Told
 from gcar_deploy.tubes.run import Run, Trial
 from gcar_deploy.tubes.targets import Target
 from gcar_deploy.tubes.ways import Trust, tree_of_ways
-from gcar_deploy.types import Array, Points
+from gcar_deploy.types import Array, Points, Scalars
 
 #: how far ways trust the predictor and the widths: the first makes the best trees, each of the
 #: others is wrong elsewhere
@@ -39,34 +40,66 @@ FAR = 1.7
 MOST_TRIALS = 100
 
 
-def relinked(
-    now: Trial, views: Sequence[VesselImage], targets: list[Target], run: Run, told: Told
-) -> Trial:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ways:
+    """What trees of ways are made of, and the first of them.
+
+    Attributes
+    ----------
+    pairs : LinePairs
+    told : (n,) what the predictor said of each pair's point
+    first : Tree
+    """
+
+    pairs: LinePairs
+    told: Scalars
+    first: Tree
+
+
+def ways_beside(
+    tree: Tree, views: Sequence[VesselImage], targets: Sequence[Target], told: Told
+) -> Ways | None:
+    """Make a tree of ways; None where it does not differ, or the pictures say too little.
+
+    Parameters
+    ----------
+    tree : Tree that was found
+    views, targets : one each; only two are paired, and only where paths or widths are true mm:
+        what raw pictures leave unexplained tells too little
+    told : Told
+    """
+    exact = all(target.calibrated or target.shown == "width" for target in targets)
+    pairs = line_pairs(views) if exact and len(views) == 2 else None
+    if pairs is None:
+        return None
+    said = told.at(pairs.points_mm)
+    first = tree_of_ways(pairs, said, TRUSTS[0])
+    if not first.branches:
+        return None
+    differ = differences(Net.of(tree), Net.of(first), [view.carm for view in views])
+    return Ways(pairs, said, first) if differ else None
+
+
+def relinked(now: Trial, ways: Ways, targets: list[Target], run: Run) -> Trial:
     """Try trees of ways, and what is best of each.
 
     Parameters
     ----------
     now : Trial, the tree that was found, fitted to these targets
-    views, targets : one each; only two are paired, and only where paths or widths are true mm:
-        what raw pictures leave unexplained tells too little
-    told : Told
+    ways : Ways beside it
+    targets : two
+    run : Run
 
     Returns
     -------
     Trial of a better tree, or ``now``
     """
-    exact = all(target.calibrated or target.shown == "width" for target in targets)
-    pairs = line_pairs(views) if exact and len(views) == 2 else None
-    if pairs is None:
+    if not _asked(now, Net.of(now.tree), Net.of(ways.first), targets, run):
         return now
-    said = told.at(pairs.points_mm)
-    first = tree_of_ways(pairs, said, TRUSTS[0])
-    if not first.branches or not _asked(now, Net.of(now.tree), Net.of(first), targets, run):
-        return now
-    tried = [run.tried(first, targets, FAR * now.loss)]
+    tried = [run.tried(ways.first, targets, FAR * now.loss)]
     if tried[0].loss > FAR * now.loss:
         return now
-    trees = [tree_of_ways(pairs, said, trust) for trust in TRUSTS[1:]]
+    trees = [tree_of_ways(ways.pairs, ways.told, trust) for trust in TRUSTS[1:]]
     tried += [run.tried(tree, targets) for tree in trees if tree.branches]
     if run.progress.stopped:
         return now

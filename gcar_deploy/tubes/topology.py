@@ -3,8 +3,8 @@
 Two views leave open which line of one is which of the other: a wrong choice explains both pictures
 nearly as well, but its vessel then seldom meets the tree that it leaves in both. So parts of the
 tree that hang on nothing are given up on trial, and their lines proposed anew, each from the tree.
-Where the paths or the widths are true mm, vessels that cross in a picture also change partners on
-trial.
+Where the paths or the widths are true mm, trees of the pictures' lines are tried beside the one
+found before that (``relink``), and vessels that cross in a picture change partners on trial.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gcar_deploy.tubes.gauss_newton import empty_objective, rescaled
 from gcar_deploy.tubes.missed import Look, MissedLine, looked_at, missed_lines
 from gcar_deploy.tubes.model import Shown
 from gcar_deploy.tubes.proposal import Told, proposal
-from gcar_deploy.tubes.relink import relinked
+from gcar_deploy.tubes.relink import relinked, ways_beside
 from gcar_deploy.tubes.run import Run, State, Trial, coarsest_pixel_mm
 from gcar_deploy.tubes.targets import Target, make_targets, trial_views
 from gcar_deploy.types import Points
@@ -72,13 +72,17 @@ def settled_topology(
     if run.evidence is None or len(views) < 2:
         return now
     told, own, coarse = Told.by(run.evidence), targets, trial_views(views)
+    ways = ways_beside(now.tree, coarse, targets, told)
+    whole = loose_mm(now.tree) < LEAST_LOOSE_MM and not _lines(now, views, targets)[1]
+    if ways is None and whole and not _doubted(now, run.progress.losses[-1], targets, run):
+        return now
     if coarse is not views:
         views, targets = coarse, make_targets(coarse, 0.0, run.options)
     # What has to be beaten has had as many steps, from as near a start.
     best = given = run.tried(now.tree, targets)
-    best = relinked(given, views, targets, run, told)
-    whole = loose_mm(best.tree) < LEAST_LOOSE_MM and not _lines(best.state, views, targets)[1]
-    if not whole:
+    if ways is not None:
+        best = relinked(given, ways, targets, run)
+    if best is not given or not whole:
         best = _hung(_with_missed(best, views, targets, run, told), views, targets, run, told)
     best = _with_partners(best, views, targets, run, told)
     if best is given:

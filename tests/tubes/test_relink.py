@@ -12,7 +12,7 @@ from gcar_deploy.tree.edit import with_branch
 from gcar_deploy.tree.tree import empty_tree
 from gcar_deploy.tubes.gauss_newton import Progress
 from gcar_deploy.tubes.proposal import Told
-from gcar_deploy.tubes.relink import relinked
+from gcar_deploy.tubes.relink import relinked, ways_beside
 from gcar_deploy.tubes.run import Run
 from gcar_deploy.tubes.targets import make_targets
 from tests.tree.shapes import fork, grid, points_of
@@ -39,7 +39,8 @@ def _tried(tree, views, believed, should_stop=None):
     run = Run(OPTIONS, Progress(), should_stop, points_of(believed, grid(64)))
     targets = make_targets(views, 0.0, OPTIONS)
     now = Run(OPTIONS, Progress(), None, run.evidence).tried(tree, targets)
-    return now, relinked(now, views, targets, run, Told.by(run.evidence))
+    ways = ways_beside(now.tree, views, targets, Told.by(run.evidence))
+    return now, relinked(now, ways, targets, run) if ways else now
 
 
 @pytest.mark.parametrize("view", [0, 1])
