@@ -12,6 +12,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
 
+# Streams of the commands that are tested are held back, as they are at most users'.
+os.environ.pop("PYTHONUNBUFFERED", None)
+
 import pytest
 
 from tests import part_times, requirements_plugin

@@ -124,8 +124,13 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     }
     try:
         code = _run(arguments, verbose)
-        # What logging could not write there would be tried once more at exit, which ends with 120.
+        # What could not be written there would be tried once more at exit, which ends with 120.
         say("", nl=False)
+        try:
+            sys.stdout.flush()
+        except OSError:
+            silence(sys.stdout)
+            code = code or INTERNAL
     finally:
         for kind, own in previous.items():
             signal.signal(kind, own)

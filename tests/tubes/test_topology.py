@@ -134,9 +134,9 @@ def _trials(monkeypatch, most_given_up):
     folder, tried = ready_case("P_0001"), []
     fit = Run.tried
 
-    def counted(run, tree, targets):
+    def counted(run, tree, targets, *more):
         tried.append((tree.points().tobytes(), tree.radii().tobytes()))
-        return fit(run, tree, targets)
+        return fit(run, tree, targets, *more)
 
     with monkeypatch.context() as patched:
         patched.setattr(Run, "tried", counted)
