@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from gcar_deploy.batch.lock import only_batch
+from gcar_deploy.batch.lock import only_one
 from gcar_deploy.errors import ModelError, UsageError
 from gcar_export.scenes.whole_file import whole_file
 from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
@@ -280,10 +280,10 @@ def alone(folders: Sequence[RunFolder]) -> contextlib.ExitStack:
     stack = contextlib.ExitStack()
     for folder in folders:
         try:
-            stack.enter_context(only_batch(folder.path, folder.path / "run.lock"))
-        except UsageError as error:
+            stack.enter_context(only_one("training", folder.path, folder.path / "run.lock"))
+        except UsageError:
             stack.close()
-            raise UsageError(str(error).replace("another batch", "another training", 1)) from None
+            raise
         for partial in folder.path.glob("*.tmp"):
             partial.unlink(missing_ok=True)
     return stack

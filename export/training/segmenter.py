@@ -211,9 +211,8 @@ class Stream(torch.utils.data.Dataset):
     def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor, int] | OSError:
         try:
             return self._item(index)
-        except (
-            OSError
-        ) as error:  # handed over: one that is raised in a worker loses its file's name
+        except OSError as error:
+            # Handed over: one that is raised in a worker loses its file's name.
             return error
 
     def _item(self, index: int) -> tuple[torch.Tensor, torch.Tensor, int]:

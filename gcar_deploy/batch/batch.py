@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.batch.cases import BatchCase
-from gcar_deploy.batch.lock import only_batch
+from gcar_deploy.batch.lock import only_one
 from gcar_deploy.batch.pools import Pool, in_processes, on_dask
 from gcar_deploy.batch.summary import write_summary
 from gcar_deploy.batch.work import BatchJob
@@ -56,7 +56,7 @@ def run_batch(
         ``force`` was not given.
     """
     rows_folder = _own(out)
-    with only_batch(out, rows_folder / "batch.lock"):
+    with only_one("batch", out, rows_folder / "batch.lock"):
         for left in rows_folder.glob("*.running"):
             left.unlink(missing_ok=True)
         rows, missing = _known(cases, out, rows_folder, engine, pool, force=force)

@@ -1,4 +1,4 @@
-"""One batch at a time in a folder."""
+"""One batch, or one training, at a time in a folder."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ _BYTE = 4096
 
 
 @contextlib.contextmanager
-def only_batch(out: Path, file: Path) -> Iterator[None]:
+def only_one(what: str, out: Path, file: Path) -> Iterator[None]:
     """Hold the folder ``out`` by a lock on ``file``, which the system takes away with the process.
+
+    ``what`` says who holds it: a batch, a training.
 
     Raises
     ------
     UsageError
-        Another batch holds it, or the file cannot be made.
+        Another one holds it, or the file cannot be made.
     """
     try:
         handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
@@ -29,9 +31,10 @@ def only_batch(out: Path, file: Path) -> Iterator[None]:
         raise UsageError(f"{out} cannot be written ({error.strerror})") from None
     with os.fdopen(handle, "r+", encoding="ascii", errors="replace") as stream:
         if not _locked(stream):
+            process = stream.readline(20).strip() or "unknown"
             raise UsageError(
-                f"another batch (process {stream.readline(20).strip() or 'unknown'}) is at work in "
-                f"{out}; wait for it or choose another folder"
+                f"another {what} (process {process}) is at work in {out}; wait for it or choose "
+                "another folder"
             )
         stream.truncate()
         stream.write(f"{os.getpid()}\n")

@@ -138,7 +138,7 @@ def _asked(now: Trial, own: Net, other: Net, targets: list[Target], run: Run) ->
     found = []
     for where in differences(own, other, [target.carm for target in targets]):
         lines = np.concatenate([own.points_mm[where.old], other.points_mm[where.new]])
-        left = sum(map(_beside, targets, pictures, [lines] * len(targets)))
+        left = sum(_beside(*seen, lines) for seen in zip(targets, pictures, strict=True))
         if left > DOUBTED * now.loss:
             found.append((left, where))
     return [where for _, where in sorted(found, key=lambda pair: -pair[0])]
