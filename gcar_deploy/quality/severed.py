@@ -33,7 +33,8 @@ def check_severed(tree: Tree, views: Sequence[VesselImage]) -> list[str]:
         left = view.catheter
         if left is not None and (distance_mm(view, ends, left, beyond=False) < NEAR_MM).any():
             return [
-                f"the tree falls into {pieces} pieces, and one ends where a catheter or lead was "
-                f"left out of view {view.view_id}: vessel may be missing, or wrongly joined"
+                f"the tree falls into {pieces} pieces, and one ends where what looks like a "
+                f"catheter or lead was left out of view {view.view_id}: vessel may be missing, or "
+                "wrongly joined"
             ]
     return []

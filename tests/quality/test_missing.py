@@ -1,6 +1,8 @@
 """A vessel that one picture shows and the tree lacks is told; a short or explained one is not."""
 
 import dataclasses
+import functools
+import re
 
 import numpy as np
 import pytest
@@ -33,6 +35,28 @@ def test_a_vessel_that_the_tree_lacks_is_told():
 def test_a_short_one_is_no_reason(length):
     shown = picture(with_second(length) if length else FIRST, 1)
     assert check_missing(FIRST, [shown]) == []
+
+
+def _twigs(count):
+    """Thin branches of 10 mm beside a vessel, which lie apart in both pictures."""
+    places = [(0, 12, -24 + 16 * k) for k in range(count)]
+    return functools.reduce(both, [straight((1, 0, 0), 10.0, 0.8, at) for at in places], FIRST)
+
+
+def test_many_short_ones_are_told_together():
+    (said,) = check_missing(FIRST, [picture(FIRST, 1), picture(_twigs(4))])
+    found = re.fullmatch(r"view 1: (\d+) mm of its lines \((\d+)%\) are explained by no .*", said)
+    assert found
+    lost, share = map(int, found.groups())
+    # 40 mm beside one of 60 mm, all foreshortened.
+    assert 30 <= lost <= 42
+    assert 36 <= share <= 50
+    assert check_missing(FIRST, [picture(FIRST, 1), picture(_twigs(1))]) == []
+
+
+def test_where_lines_may_be_background_they_are_not():
+    grey = dataclasses.replace(picture(_twigs(4)), kind="raw", path_error=0.25)
+    assert check_missing(FIRST, [picture(FIRST, 1), grey]) == []
 
 
 def test_a_picture_without_lines_says_nothing():
