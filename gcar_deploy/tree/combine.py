@@ -28,8 +28,11 @@ SAME_MM, LEAST_MM = 1.0, 4.0
 LINE_MM, SHARED = 0.8, 3
 #: a part hangs on the tree where that passes so near to where it began on its own, mm
 JOIN_MM = 1.5
-#: of two ways to an end, that through the new part is taken if it is this many times as long
-NEW_LENGTH = 0.3
+#: what is left of a way behind a cut goes too where it is shorter, mm
+STUB_MM = 4.0
+#: of two ways to an end, that of both trees, or through the new part, is taken if it is at most
+#: so many times as long as one that the other tree lacks
+DOUBTED_LENGTH = 10.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,10 +93,12 @@ class Difference:
     Attributes
     ----------
     old, new : (n,), (m,) bool, points of the one and of the other
+    off : (n,) bool, all points of the one that lie off the other
     """
 
     old: Array
     new: Array
+    off: Array
 
 
 def differences(one: Net, other: Net, carms: Sequence[CArm]) -> list[Difference]:
@@ -126,7 +131,7 @@ def differences(one: Net, other: Net, carms: Sequence[CArm]) -> list[Difference]
             for own, label in zip(part, np.split(group, [count[0]]), strict=True)
         )
         if max(one.touching_mm(old), other.touching_mm(new)) >= LEAST_MM:
-            out.append(Difference(old, new))
+            out.append(Difference(old, new, off[0]))
     return out
 
 
@@ -165,8 +170,8 @@ def _sharing(
 def combined(one: Net, other: Net, where: Difference) -> Tree:
     """Return the first tree with the second's word where they differ.
 
-    Ends stay ends: what led nowhere else goes with what is taken out, and of loops that arise what
-    is nearer to the widest end by the new part stays.
+    Ends stay ends, and what both trees have in common stays where it leads to none, but for stubs.
+    Loops that arise are opened where the second tree has nothing, if they can be.
     """
     size = len(one.points_mm)
     left = one.steps[~where.old[one.steps].any(axis=1)]
@@ -186,31 +191,50 @@ def combined(one: Net, other: Net, where: Difference) -> Tree:
         np.concatenate([left, came]),
     )
     ends = np.concatenate([one.ends & ~where.old, other.ends & where.new])
-    return _tree_to(whole, ends, np.arange(len(whole.steps)) >= len(left))
+    doubted = np.concatenate([where.off, np.zeros(len(other.points_mm), bool)])
+    return _tree_to(whole, ends, doubted)
 
 
-def _tree_to(net: Net, ends: Array, new: Array) -> Tree:
-    """Return the shortest ways to (n,) bool ends, from the widest of each part, as a tree."""
+def _tree_to(net: Net, ends: Array, doubted: Array) -> Tree:
+    """Return the shortest ways from the widest end of each part, as a tree.
+
+    Those to (n,) bool ends, and what more of them is longer than a stub and not (n,) bool doubted,
+    which counts as farther.
+    """
     size = len(net.points_mm)
     one, other = net.steps.T
     length = np.linalg.norm(net.points_mm[one] - net.points_mm[other], axis=1) + 1e-6
-    length = length * np.where(new, NEW_LENGTH, 1.0)
+    length = length * np.where(doubted[net.steps].any(axis=1), DOUBTED_LENGTH, 1.0)
     graph = sparse.csr_matrix((length, (one, other)), shape=(size, size))
     label = csgraph.connected_components(graph, directed=False)[1]
-    asked = np.flatnonzero(ends & (np.bincount(net.steps.ravel(), minlength=size) > 0))
+    some = np.bincount(net.steps.ravel(), minlength=size) > 0
     steps: set[tuple[int, int]] = set()
-    for part in np.unique(label[asked]):
-        own = asked[label[asked] == part]
-        root = int(own[net.radius_mm[own].argmax()])
-        before = csgraph.dijkstra(graph, directed=False, indices=root, return_predecessors=True)[1]
-        for end in own.tolist():
-            while end != root:
-                step = (min(end, int(before[end])), max(end, int(before[end])))
+    for part in np.unique(label[some]):
+        own = np.flatnonzero((label == part) & some)
+        first = own[ends[own]] if ends[own].any() else own
+        root = int(first[net.radius_mm[first].argmax()])
+        far, before = csgraph.dijkstra(
+            graph, directed=False, indices=root, return_predecessors=True
+        )
+        sure = own[~doubted[own]]
+        leads = np.bincount(before[sure][before[sure] >= 0], minlength=size) > 0
+        last = sure[~leads[sure] & ~ends[sure]]
+        for end in (*own[ends[own]], *last[np.argsort(-far[last], kind="stable")]):
+            way, at = [], int(end)
+            while at != root:
+                step = (min(at, int(before[at])), max(at, int(before[at])))
                 if step in steps:
                     break
-                steps.add(step)
-                end = int(before[end])
+                way.append(step)
+                at = int(before[at])
+            if ends[end] or _length_mm(net, way) >= STUB_MM:
+                steps.update(way)
     return _drawn(net, sorted(steps))
+
+
+def _length_mm(net: Net, steps: list[tuple[int, int]]) -> float:
+    gaps = [net.points_mm[a] - net.points_mm[b] for a, b in steps]
+    return float(np.linalg.norm(np.array(gaps).reshape(-1, 3), axis=1).sum())
 
 
 def _drawn(net: Net, steps: list[tuple[int, int]]) -> Tree:

@@ -2,7 +2,8 @@
 
 Starting points are chosen place by place; where the predictor is in doubt, that makes trees that
 no small change mends. Trees of ways through the pairs of both views' lines are wrong elsewhere.
-From the best of them on, each place where another tree differs is tried with its word.
+From the best of them on, each place where another tree differs is tried with its word. Of true
+paths the tree that was found may be the best; of masks, whose objective tells less, it is no start.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ BETTER, PER_MM = 0.005, 0.05
 #: a trial whose objective is so many times as large after its first steps is given up
 HOPELESS = 1.5
 #: nothing is made of ways where the first tree of them leaves so many times as much: on generated
-#: pairs that were right already most do
-FAR = 1.7
+#: pairs that were right already most do; of true paths, and of masks
+FAR_EXACT, FAR = 4.0, 1.7
 #: so many trials at most
 MOST_TRIALS = 100
 
@@ -96,15 +97,22 @@ def relinked(now: Trial, ways: Ways, targets: list[Target], run: Run) -> Trial:
     """
     if not _asked(now, Net.of(now.tree), Net.of(ways.first), targets, run):
         return now
-    tried = [run.tried(ways.first, targets, FAR * now.loss)]
-    if tried[0].loss > FAR * now.loss:
+    exact = all(target.calibrated for target in targets)
+    far = (FAR_EXACT if exact else FAR) * now.loss
+    tried = [run.tried(ways.first, targets, far)]
+    if tried[0].loss > far:
         return now
     trees = [tree_of_ways(ways.pairs, ways.told, trust) for trust in TRUSTS[1:]]
     tried += [run.tried(tree, targets) for tree in trees if tree.branches]
     if run.progress.stopped:
         return now
-    best, *others = sorted(tried, key=lambda one: one.loss)
-    found = _with_the_best_of([now.tree, *(one.tree for one in others)], best, targets, run)
+    tried.sort(key=lambda one: one.loss)
+    if exact and now.loss <= tried[0].loss:
+        best, others = now, tried
+    else:
+        best, *others = tried
+        others = [now, *others]
+    found = _with_the_best_of([one.tree for one in others], best, targets, run)
     return found if _better(found, now) else now
 
 

@@ -30,8 +30,8 @@ SIDE = _line((0, 0, 15), (10, 18, 5))
 
 def _whole(tree):
     net = Net.of(tree)
-    none = Difference(np.zeros(len(net.points_mm), bool), np.zeros(len(net.points_mm), bool))
-    return combined(net, net, none)
+    none = np.zeros(len(net.points_mm), bool)
+    return combined(net, net, Difference(none, none, none))
 
 
 def _same(one, other, mm=0.6):
@@ -126,6 +126,36 @@ def test_of_a_loop_the_new_way_stays():
     after = combined(*nets, came)
     assert len(after.branches) == 1
     assert cKDTree(after.points()).query(np.array(bow))[0].max() < 1.2
+
+
+def test_what_both_have_stays_where_its_end_goes():
+    """The end of the one's way is taken out, the other's, elsewhere in all views, not put in."""
+    middle = (-10, 2.5, -10)
+    begun = _line((0, 0, 0), middle)
+    wrong, right = _line(middle, (-12, 3, -45)), _line(middle, (-45, 25, 0))
+    one = _vessels(STEM, RIGHT, np.concatenate([begun, wrong[1:]]))
+    other = _vessels(STEM, RIGHT, np.concatenate([begun, right[1:]]))
+    nets = Net.of(one), Net.of(other)
+    (taken,) = (way for way in differences(*nets, two_views()) if way.old.any())
+    assert not taken.new.any()
+    after = combined(*nets, taken)
+    assert cKDTree(after.points()).query(begun)[0].max() < 1.5
+    assert cKDTree(after.points()).query(wrong[20:])[0].min() > 5
+
+
+def test_a_loop_is_opened_where_the_other_tree_has_nothing():
+    """The upper half of a vessel comes; what its lower half hung on by mistake goes."""
+    upper, lower = RIGHT[:20], RIGHT[20:]
+    link = _line(LEFT[-1], lower[-1])
+    other = _vessels(STEM, LEFT, RIGHT)
+    one = _vessels(STEM, np.concatenate([LEFT, link[1:], lower[-2::-1]]))
+    nets = Net.of(one), Net.of(other)
+    (came,) = (way for way in differences(*nets, two_views()) if way.new.any())
+    assert not came.old.any()
+    after = combined(*nets, came)
+    assert cKDTree(after.points()).query(np.concatenate([LEFT, upper, lower]))[0].max() < 1.5
+    assert len(after.branches) == 3
+    assert after.length_mm < other.length_mm + 4
 
 
 @pytest.mark.parametrize("side", [0, 1])

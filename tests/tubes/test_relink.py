@@ -35,6 +35,10 @@ def _along_a_ray(view, by_mm):
     return truth, wrong
 
 
+def _with_lines(views):
+    return [dataclasses.replace(view, skeleton=skeletonize(view.mask)) for view in views]
+
+
 def _tried(tree, views, believed, should_stop=None):
     run = Run(OPTIONS, Progress(), should_stop, points_of(believed, grid(64)))
     targets = make_targets(views, 0.0, OPTIONS)
@@ -53,6 +57,14 @@ def test_a_vessel_at_a_wrong_depth_comes_right_though_it_is_believed_in(view):
     assert cKDTree(found.tree.points()).query(truth.points())[0].max() < 2.5
 
 
+def test_of_true_paths_a_vessel_at_a_wrong_depth_comes_right():
+    carms = two_views()
+    truth, wrong = _along_a_ray(carms[0], 9.0)
+    now, found = _tried(wrong, _with_lines(seen(truth, carms, calibrated=True)), wrong)
+    assert found.loss < 0.2 * now.loss
+    assert cKDTree(found.tree.points()).query(truth.points())[0].max() < 2.5
+
+
 def test_a_right_tree_stays_as_it_is():
     carms = two_views()
     now, found = _tried(fork(), seen_as_masks(fork(), carms), fork())
@@ -62,11 +74,7 @@ def test_a_right_tree_stays_as_it_is():
 def test_paths_that_are_estimates_say_too_little():
     carms = two_views()
     truth, wrong = _along_a_ray(carms[0], 9.0)
-    views = [
-        dataclasses.replace(view, skeleton=skeletonize(view.mask))
-        for view in seen(truth, carms, calibrated=False)
-    ]
-    now, found = _tried(wrong, views, wrong)
+    now, found = _tried(wrong, _with_lines(seen(truth, carms, calibrated=False)), wrong)
     assert found is now
 
 
