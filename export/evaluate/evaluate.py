@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import logging
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -23,6 +22,7 @@ from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
 from gcar_export.evaluate.jobs import NO_CASE, Job, case_name, row_path, write_done
+from gcar_export.methods.own_models import sha256
 from gcar_export.methods.settings import METHODS, RUNTIME_ROWS, MethodSettings
 from gcar_export.methods.solve import check_models
 from gcar_export.scenes.label_files import label_files
@@ -157,7 +157,7 @@ def evaluate(
     _check_own(options)
     digests = {method: options.settings.digest(method) for method in options.methods}
     models = {m: options.settings.own_models(m).said() for m in options.methods}
-    data = {label: None if generated else _sha256(label) for label in labels}
+    data = {label: None if generated else sha256(label) for label in labels}
     jobs = [
         Job(
             label=label, protocol=protocol, method=method, views=views, digest=digests[method],
@@ -319,11 +319,6 @@ def _make_folders(options: EvaluateOptions) -> None:
             "settings": options.settings.of(method),
         }
     path.write_text(json.dumps(known, indent=1, default=str))
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read(path: Path) -> dict[str, Any]:

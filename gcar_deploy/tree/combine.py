@@ -81,9 +81,14 @@ class Net:
 
     def touching_mm(self, some: Array) -> float:
         """Length of the steps with one or both ends among (n,) bool points, mm."""
-        steps = self.steps[some[self.steps].any(axis=1)]
-        gaps = self.points_mm[steps[:, 0]] - self.points_mm[steps[:, 1]]
-        return float(np.linalg.norm(gaps, axis=1).sum())
+        return float(self.lengths_mm(self.steps[some[self.steps].any(axis=1)]).sum())
+
+    def lengths_mm(self, steps: Array) -> Scalars:
+        """(s,) length of (s, 2) steps between its points, mm."""
+        gaps: Scalars = np.linalg.norm(
+            self.points_mm[steps[:, 0]] - self.points_mm[steps[:, 1]], axis=1
+        )
+        return gaps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -203,38 +208,42 @@ def _tree_to(net: Net, ends: Array, doubted: Array) -> Tree:
     """
     size = len(net.points_mm)
     one, other = net.steps.T
-    length = np.linalg.norm(net.points_mm[one] - net.points_mm[other], axis=1) + 1e-6
-    length = length * np.where(doubted[net.steps].any(axis=1), DOUBTED_LENGTH, 1.0)
+    length = (net.lengths_mm(net.steps) + 1e-6) * np.where(
+        doubted[net.steps].any(axis=1), DOUBTED_LENGTH, 1.0
+    )
     graph = sparse.csr_matrix((length, (one, other)), shape=(size, size))
     label = csgraph.connected_components(graph, directed=False)[1]
     some = np.bincount(net.steps.ravel(), minlength=size) > 0
     steps: set[tuple[int, int]] = set()
     for part in np.unique(label[some]):
         own = np.flatnonzero((label == part) & some)
-        first = own[ends[own]] if ends[own].any() else own
-        root = int(first[net.radius_mm[first].argmax()])
+        asked = own[ends[own]]
+        likely = asked if len(asked) else own
+        root = int(likely[net.radius_mm[likely].argmax()])
         far, before = csgraph.dijkstra(
             graph, directed=False, indices=root, return_predecessors=True
         )
         sure = own[~doubted[own]]
         leads = np.bincount(before[sure][before[sure] >= 0], minlength=size) > 0
         last = sure[~leads[sure] & ~ends[sure]]
-        for end in (*own[ends[own]], *last[np.argsort(-far[last], kind="stable")]):
-            way, at = [], int(end)
-            while at != root:
-                step = (min(at, int(before[at])), max(at, int(before[at])))
-                if step in steps:
-                    break
-                way.append(step)
-                at = int(before[at])
-            if ends[end] or _length_mm(net, way) >= STUB_MM:
+        for end in (*asked, *last[np.argsort(-far[last], kind="stable")]):
+            way = _way(before, int(end), root, steps)
+            added = net.lengths_mm(np.array(way, np.int64).reshape(-1, 2)).sum()
+            if ends[end] or added >= STUB_MM:
                 steps.update(way)
     return _drawn(net, sorted(steps))
 
 
-def _length_mm(net: Net, steps: list[tuple[int, int]]) -> float:
-    gaps = [net.points_mm[a] - net.points_mm[b] for a, b in steps]
-    return float(np.linalg.norm(np.array(gaps).reshape(-1, 3), axis=1).sum())
+def _way(before: Array, end: int, root: int, steps: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the steps from an end back to the root, or to the first of those there already."""
+    way, at = [], end
+    while at != root:
+        step = (min(at, int(before[at])), max(at, int(before[at])))
+        if step in steps:
+            break
+        way.append(step)
+        at = int(before[at])
+    return way
 
 
 def _drawn(net: Net, steps: list[tuple[int, int]]) -> Tree:

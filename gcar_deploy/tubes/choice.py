@@ -26,7 +26,7 @@ from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.tubes.model import Tubes, footprint, tubes_of
 from gcar_deploy.tubes.shares import best_shares
 from gcar_deploy.tubes.support import least_seen
-from gcar_deploy.tubes.targets import Target
+from gcar_deploy.tubes.targets import Target, exact_paths
 from gcar_deploy.types import Array, Points, Scalars
 
 #: branches are judged in pieces of at most this length, mm
@@ -145,7 +145,7 @@ def reinstated(
     left : per view (rows, cols), path that the kept pieces leave unexplained, mm
     """
     tubes, radius = tubes_of(tree), start_radius
-    if all(target.calibrated for target in targets):
+    if exact_paths(targets):
         # The points know no stenosis: a narrow vessel shows too small a share of so wide a path.
         # Where paths are estimates they run low, and a ghost as narrow as they say comes back.
         radius = np.minimum(radius, radius_alone(tubes, targets))
@@ -193,7 +193,7 @@ def weigh_pieces(
         usual = _weighted_median(confidence[kept], total[kept])
         trusted = confidence >= TRUSTED_SHARE * usual
         share, tie = np.where(trusted, 1.0, share), tie & ~trusted
-    if not all(target.calibrated for target in targets):
+    if not exact_paths(targets):
         share = wanted_parts((share - MIN_SHARE) * total, joints, PART_MM).astype(np.float64)
     return Pieces(segment, total, confidence, share, tie)
 

@@ -23,7 +23,7 @@ from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tubes.arrow import Arrow
 from gcar_deploy.tubes.model import Footprint, Tubes, footprint
 from gcar_deploy.tubes.prior import Prior, columns_of
-from gcar_deploy.tubes.targets import Target
+from gcar_deploy.tubes.targets import Target, exact_paths
 from gcar_deploy.types import Array, Scalars
 
 #: a level ends when a step lowers the objective by less than this share
@@ -134,7 +134,7 @@ def fit_level(
         taken += 1
         tubes, prints, loss = trial, trial_prints, value
         targets = rescaled(targets, prints)
-        if not all(target.calibrated for target in targets):
+        if not exact_paths(targets):
             # The next step has to beat the objective under the contrast it is judged by.
             loss = objective(tubes, targets, prints, prior, options)
         progress.steps += 1

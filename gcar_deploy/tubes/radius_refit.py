@@ -27,7 +27,7 @@ from gcar_deploy.tubes.gauss_newton import (
     weights_of,
 )
 from gcar_deploy.tubes.model import Footprint, Tubes
-from gcar_deploy.tubes.targets import Target
+from gcar_deploy.tubes.targets import Target, exact_paths
 from gcar_deploy.types import Scalars
 
 #: noise of the path length, mm
@@ -55,7 +55,7 @@ def refit_radii(
     tubes, and where they fall; as given where a picture is not calibrated, whose contrast would
     have to be guessed along with the radii, or where a step leaves the finite numbers
     """
-    if not all(target.calibrated for target in targets) or not len(tubes.log_radius):
+    if not exact_paths(targets) or not len(tubes.log_radius):
         return tubes, prints
     sharp = [
         dataclasses.replace(target, sigma_mm=NOISE_MM + options.noise_share * target.path_mm)

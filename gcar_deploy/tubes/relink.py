@@ -21,7 +21,7 @@ from gcar_deploy.tubes.exchange import costs
 from gcar_deploy.tubes.line_pairs import LinePairs, line_pairs
 from gcar_deploy.tubes.proposal import Told
 from gcar_deploy.tubes.run import Run, Trial
-from gcar_deploy.tubes.targets import Target
+from gcar_deploy.tubes.targets import Target, exact_paths, true_mm
 from gcar_deploy.tubes.ways import Trust, tree_of_ways
 from gcar_deploy.types import Array, Points, Scalars
 
@@ -69,8 +69,7 @@ def ways_beside(
         what raw pictures leave unexplained tells too little
     told : Told
     """
-    exact = all(target.calibrated or target.shown == "width" for target in targets)
-    pairs = line_pairs(views) if exact and len(views) == 2 else None
+    pairs = line_pairs(views) if true_mm(targets) and len(views) == 2 else None
     if pairs is None:
         return None
     said = told.at(pairs.points_mm)
@@ -97,7 +96,7 @@ def relinked(now: Trial, ways: Ways, targets: list[Target], run: Run) -> Trial:
     """
     if not _asked(now, Net.of(now.tree), Net.of(ways.first), targets, run):
         return now
-    exact = all(target.calibrated for target in targets)
+    exact = exact_paths(targets)
     far = (FAR_EXACT if exact else FAR) * now.loss
     tried = [run.tried(ways.first, targets, far)]
     if tried[0].loss > far:

@@ -95,6 +95,16 @@ def make_targets(
     return [_target(view, level_mm, options) for view in views]
 
 
+def exact_paths(targets: Sequence[Target]) -> bool:
+    """Whether the paths of all views are true mm."""
+    return all(target.calibrated for target in targets)
+
+
+def true_mm(targets: Sequence[Target]) -> bool:
+    """Whether each view tells something in true mm: paths, or a mask's widths."""
+    return all(target.calibrated or target.shown == "width" for target in targets)
+
+
 def trial_views(views: Sequence[VesselImage]) -> Sequence[VesselImage]:
     """Coarsen pictures to what trees are tried on; the same ones where none is so fine."""
     factors = [int(TRIAL_MM / view.carm.pixel_at_isocenter_mm + 1e-6) for view in views]

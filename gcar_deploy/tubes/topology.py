@@ -25,7 +25,7 @@ from gcar_deploy.tubes.model import Shown
 from gcar_deploy.tubes.proposal import Told, proposal
 from gcar_deploy.tubes.relink import relinked, ways_beside
 from gcar_deploy.tubes.run import Run, State, Trial, coarsest_pixel_mm
-from gcar_deploy.tubes.targets import Target, make_targets, trial_views
+from gcar_deploy.tubes.targets import Target, exact_paths, make_targets, trial_views, true_mm
 from gcar_deploy.types import Points
 
 #: a vessel that was missed is kept where it lowers the objective by this share ...
@@ -121,10 +121,9 @@ def _with_partners(
 
 def _doubted(now: State, loss: float, targets: list[Target], run: Run) -> list[TrialExchange]:
     """Return the exchanges that stand to gain, those of the worst explained stretches first."""
-    told = all(target.calibrated or target.shown == "width" for target in targets)
-    if len(targets) != 2 or not told or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
+    if len(targets) != 2 or not true_mm(targets) or coarsest_pixel_mm(targets) > MOST_PIXEL_MM:
         return []
-    by: Shown = "path" if _exact(targets) else "width"
+    by: Shown = "path" if exact_paths(targets) else "width"
     found = trial_exchanges(now.tree, [target.carm for target in targets])
     if not found:
         return []
@@ -182,7 +181,7 @@ def _with_some(
         if run.progress.stopped:
             break
         price = EARNED * now.loss
-        if not _exact(targets):
+        if not exact_paths(targets):
             price = max(price, EARNED_PER_MM * (trial.tree.length_mm - now.tree.length_mm))
         if trial.loss < now.loss - price:
             now = trial
@@ -229,16 +228,11 @@ def _hung(
     other = _with_missed(hanging, views, targets, run, told)
     if run.progress.stopped:
         return given
-    price = 0.0 if _exact(targets) else LOOSE_PER_MM
+    price = 0.0 if exact_paths(targets) else LOOSE_PER_MM
     if known is not None:
         price = TORN_PER_MM
     values = [one.loss + price * loose_mm(one.tree) for one in (given, other)]
     return other if values[1] < values[0] else given
-
-
-def _exact(targets: Sequence[Target]) -> bool:
-    """Whether the paths of all views are true mm."""
-    return all(target.calibrated for target in targets)
 
 
 def loose_mm(tree: Tree) -> float:
