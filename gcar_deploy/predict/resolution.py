@@ -130,4 +130,5 @@ def _by_section(view: VesselImage) -> Array:
         for picture in (view.path_mm, view.skeleton)
     )
     section = mass * pixel / np.maximum(line * STEP_PX, 1.0)
-    return np.sqrt(section / np.pi)
+    # Where noise outweighs the paths their sum tells nothing.
+    return np.sqrt(np.where(section > 0, section, np.inf) / np.pi)

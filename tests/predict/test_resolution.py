@@ -63,6 +63,14 @@ def test_noise_that_widens_shadows_does_not_coarsen_the_cells(radius_mm: float) 
     assert cells[1] == pytest.approx(cells[0], rel=0.2)
 
 
+def test_noise_that_outweighs_the_paths_tells_no_width() -> None:
+    """Sums below 0 have no root: the shadow's own width counts."""
+    clean = views(0.4)
+    dark = [dataclasses.replace(one, path_mm=one.path_mm - 9.0, noise_mm=0.1) for one in clean]
+    with np.errstate(invalid="raise"):
+        assert resolution(dark, GRID, OPTIONS, FINE) == resolution(clean, GRID, OPTIONS, FINE)
+
+
 def test_where_only_coarser_cells_are_known_the_threshold_falls() -> None:
     known = {"spacing_mm": [0.6, 1.5], "path_cells": [0.15, 0.5]}
     found = resolution(views(0.25), GRID, OPTIONS, known)
