@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.tree.curves import MIN_RADIUS_MM, resample
 from gcar_deploy.tree.edit import NEW_STEP_MM
-from gcar_deploy.tree.tree import Branch, Tree, empty_tree
+from gcar_deploy.tree.tree import Branch, Tree, empty_tree, polyline_arc
 from gcar_deploy.types import Array, Points, Scalars
 
 #: a point of one tree is that of another whose points lie so near, mm; shorter parts are no matter
@@ -269,12 +269,15 @@ def _drawn(net: Net, steps: list[tuple[int, int]]) -> Tree:
 def _branch(net: Net, way: list[int], start: int, end: int) -> Branch:
     points = net.points_mm[way]
     line = resample(points, NEW_STEP_MM)
-    nearest = cKDTree(points).query(line)[1]
+    # Between two points, not from the nearer one: half-way, rounding would choose it.
+    arc = polyline_arc(points)
+    at = np.linspace(0.0, arc[-1], len(line))
+    radius, confidence = (np.interp(at, arc, v[way]) for v in (net.radius_mm, net.confidence))
     return Branch(
         points_mm=line,
-        radius_mm=np.maximum(net.radius_mm[way][nearest], MIN_RADIUS_MM),
+        radius_mm=np.maximum(radius, MIN_RADIUS_MM),
         sigma_mm=np.full(len(line), np.nan),
-        confidence=net.confidence[way][nearest],
+        confidence=confidence,
         start=start,
         end=end,
     )

@@ -30,6 +30,9 @@ MIN_SINE = 0.2
 #: what a picture tells of tubes, in mm: the path of each ray through them all, or the chord that
 #: the width of the widest tells
 Shown: TypeAlias = Literal["path", "width"]
+#: paths that are equal in so many digits, mm, are ties: branches that share a node may be as wide
+#: as each other beyond it, and rounding would choose between them
+TIE_DIGITS = 9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -270,11 +273,11 @@ def _widest(pairing: Pairing, path: Scalars) -> Scalars:
     """Per entry: 1 for the longest of its pixel, the first of ties, 0 for what that hides."""
     factor = np.ones(len(path))
     a, b = pairing.double
-    hidden = path[b] > path[a]
+    hidden = path[b] > path[a] + 10.0**-TIE_DIGITS
     factor[a], factor[b] = ~hidden, hidden
     more = pairing.several
     group = pairing.several_group
-    order = np.lexsort((-path[more], group))
+    order = np.lexsort((-np.round(path[more], TIE_DIGITS), group))
     factor[more] = 0.0
     factor[more[order[np.flatnonzero(np.diff(group[order], prepend=-1))]]] = 1.0
     return factor

@@ -6,8 +6,8 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.tree.combine import Difference, Net, combined, differences
 from gcar_deploy.tree.edit import with_branch
-from gcar_deploy.tree.tree import empty_tree
-from tests.tree.shapes import fork
+from gcar_deploy.tree.tree import Tree, empty_tree
+from tests.tree.shapes import branch, fork
 from tests.tubes.scenes import two_views
 
 
@@ -45,6 +45,15 @@ def test_a_tree_as_points_and_steps_is_the_tree_again():
     assert again.length_mm == pytest.approx(tree.length_mm, rel=0.02)
     assert sorted(again.degrees) == sorted(tree.degrees)
     assert _same(tree, again)
+
+
+def test_radii_lie_between_those_of_neighbours():
+    """Points half-way between two are not given either one's, which rounding would choose."""
+    line = _line((0, 0, 30), (0, 0, 0), 16)
+    steep = Tree(nodes_mm=line[[0, -1]], branches=(branch(line, np.linspace(3.0, 1.0, 16)),))
+    (again,) = _whole(steep).branches
+    top = np.linalg.norm(again.points_mm - (0, 0, 30), axis=1)
+    np.testing.assert_allclose(again.radius_mm, 3.0 - top / 15.0, atol=1e-9)
 
 
 def test_like_trees_do_not_differ():

@@ -104,6 +104,24 @@ def test_of_tubes_behind_one_another_the_widest_shows(radii):
     assert not both.d_axis[:, hidden].any() and not both.d_log_radius[hidden].any()
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_rounding_does_not_choose_between_tubes_as_wide_as_each_other(seed):
+    """Branches that end in one node are caps of one size beyond it, of numbers added up."""
+    view, rng = carm(31, 17), np.random.default_rng(seed)
+    nodes = np.array([[1.237, 0.411, -0.893], [-9.1, 1.3, 14.7], [-4.3, 2.6, 17.9]])
+    wide, thin = rng.uniform(0.6, 0.97), rng.uniform(0.3, 0.7, 2)
+
+    def seen(off):
+        place = nodes + off * rng.normal(size=nodes.shape)
+        branches = [
+            branch(place[[k, 0]], [thin[k - 1], wide * (1 + 7 * off)], k, 0) for k in (1, 2)
+        ]
+        tree = Tree(nodes_mm=place, branches=tuple(branches))
+        return footprint(tubes_of(tree), view, 1.0, shown="width").path_mm
+
+    np.testing.assert_allclose(seen(1e-12), seen(0.0), atol=1e-6)
+
+
 def test_pairs_kept_from_before_give_the_same_picture():
     tubes, view = tubes_of(fork()), carm(30, 20)
     first = footprint(tubes, view, 1.0)
