@@ -32,7 +32,7 @@ from gcar_export.studies.gate_rows import (
     read_rows,
 )
 from gcar_export.studies.gate_table import choose, cost, replayed
-from tests.conftest import data_dir
+from tests.conftest import data_dir, of_data
 
 GATES = QualityOptions()
 SEED = 50_003
@@ -112,6 +112,16 @@ def test_a_real_tree_gives_the_pictures_of_the_protocol():
         make_pair(subject, subject, "same", "raw", 0).angiograms, case.pictures, strict=True
     ):
         np.testing.assert_array_equal(view.pixels, picture)
+
+
+@pytest.mark.slow
+def test_a_real_line_follows_vessels_thinner_than_a_voxel():
+    file = of_data("asoca", "normal_1.npz")
+    left = read_label(file).left_right()[0].centred()
+    vessel = left.grid.index2world(np.argwhere(left.occupancy > 0.3).astype(np.float64))
+    line = real_subject(file).line_mm
+    np.testing.assert_allclose(line.min(axis=0), vessel.min(axis=0), atol=4.0)
+    np.testing.assert_allclose(line.max(axis=0), vessel.max(axis=0), atol=4.0)
 
 
 @pytest.mark.slow
