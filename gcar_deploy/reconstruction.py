@@ -216,7 +216,10 @@ class Reconstruction:
             "separation_deg": self.quality.separation_deg,
             "epipolar_disagreement": self.quality.disagreement,
             "views": [self._view(k) for k in range(len(self.views))],
-            "silent_errors": list(silent_errors(self._carms, exact=self._exact)),
+            # Of the geometry as told: a pose that was found for it hides a scale that is wrong.
+            "silent_errors": list(
+                silent_errors([a.carm for a in self.angiograms], exact=self._exact)
+            ),
             "tree": {
                 "length_mm": self.tree.length_mm,
                 "parts_mm": list(part_lengths_mm(self.tree)),

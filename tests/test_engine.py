@@ -403,6 +403,17 @@ def test_a_moved_patient_is_noticed(case, engine):
     result = engine.reconstruct(moved, grid)
     along = result.poses[1].offset_mm[2]
     assert along < -1.0
-    assert json.loads(result.to_json())["views"][1]["estimated_offset_mm"][2] == pytest.approx(
-        along
+    said = json.loads(result.to_json())
+    assert said["views"][1]["estimated_offset_mm"][2] == pytest.approx(along)
+
+
+def test_a_pose_that_was_found_hides_no_silent_error(case, engine):
+    angiograms, grid, _ = case
+    result = engine.reconstruct(angiograms, grid)
+    first, second = result.views
+    far = dataclasses.replace(second, carm=second.carm.moved((0.0, 0.0, 12.0)))
+    told, found = (
+        json.loads(one.to_json())["silent_errors"]
+        for one in (result, dataclasses.replace(result, views=(first, far)))
     )
+    assert told == found and any("pixel spacing" in text for text in told)

@@ -39,11 +39,12 @@ from gcar_deploy.tubes import Footprint
 from gcar_deploy.types import Array, Mask, Scalars
 
 OK, DEGRADED, REFUSED = "ok", "degraded", "refused"
-#: what ``ok`` rests on, and what no result of few views can rest on
+#: what ``ok`` rests on, of two views and of more, and what no result of few views can rest on
 _CHECKED = (
-    "Checked: agreement and order of the views, what they show of the tree and it of them, its "
-    "size, exchangeable vessels and probable ghosts."
+    "Checked: agreement and order of the views, what they show of the tree and it of them, its size"
 )
+_OF_TWO = ", exchangeable vessels and probable ghosts."
+_OF_MORE = ". Exchangeable vessels and probable ghosts are looked for in two views alone."
 _UNSEEN = (
     "Views cannot check a shift or turn within the plane of their beams, nor vessel that no "
     "picture shows."
@@ -263,7 +264,8 @@ def check_explained(
 
 def _sentence(findings: Sequence[str], tree: Tree, count: int) -> str:
     if not findings:
-        return f"All {count} views are explained by {_pieces(tree)}. {_CHECKED} {_UNSEEN}"
+        checked = _CHECKED + (_OF_TWO if count == 2 else _OF_MORE)
+        return f"All {count} views are explained by {_pieces(tree)}. {checked} {_UNSEEN}"
     more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
     text = findings[0][0].upper() + findings[0][1:] + more
     return text if text.endswith("?") else f"{text}."

@@ -175,6 +175,9 @@ def test_ok_says_what_was_checked_what_was_not_and_how_many_pieces(case):
     lumen = [v.mask for v in views]
     whole = assess(tree, views, lumen, [], 0.01, OPTIONS).sentence
     assert "explained by one tree." in whole and "Checked:" in whole and "cannot check" in whole
+    assert "its size, exchangeable vessels and probable ghosts." in whole
+    several = assess(tree, [*views, views[0]], [*lumen, lumen[0]], [], 0.01, OPTIONS).sentence
+    assert "its size. Exchangeable vessels and probable ghosts are looked for in two" in several
     first, *others = tree.branches
     ends = np.arange(2) + len(tree.nodes_mm)
     loose = dataclasses.replace(first, start=int(ends[0]), end=int(ends[1]))
