@@ -80,24 +80,27 @@ def recovers(own: Sections, line: Scalars, clear: Array, going_on: float) -> Arr
     return out
 
 
-def narrowest(share: Scalars, among: Array) -> list[tuple[int, int, int]]:
+def narrowest(share: Scalars, clear: Array, again: Array) -> list[tuple[int, int, int]]:
     """Sections where each lesion is narrowest, begins and ends, the gravest first.
 
     Two are separate where the vessel between them comes half of the way back from the slighter to
-    its reference: less is the rough wall of one.
+    its reference: less is the rough wall of one. A lesion ends at the latest where the vessel is
+    wider for the last time: what narrows for good behind it is none.
 
     Parameters
     ----------
     share : (m,) diameter as a share of the reference
-    among : (m,) bool, where a lesion may be narrowest
+    clear, again : (m,) bool, where a lesion may be narrowest, and as of ``recovers``
     """
-    deep = np.flatnonzero(among & (share < 1 - LESION_SHARE))
+    deep = np.flatnonzero(clear & again & (share < 1 - LESION_SHARE))
+    recovered = min(int(np.flatnonzero(again)[-1]) + 1, len(share) - 1) if again.any() else 0
     found: list[int] = []
     for k in deep[np.argsort(share[deep], kind="stable")].tolist():
         half = 0.5 * (1 + share[k])
         if all(share[min(k, other) : max(k, other)].max() >= half for other in found):
             found.append(k)
-    return [(k, *_borders(share, k, found)) for k in found]
+    spots = ((k, *_borders(share, k, found)) for k in found)
+    return [(k, first, min(last, recovered)) for k, first, last in spots]
 
 
 def slightest(share: Scalars, searched: Array, again: Array) -> int:

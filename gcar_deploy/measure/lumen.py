@@ -147,7 +147,7 @@ def _lumen(
     share = own.diameter_mm / line
     again = recovers(own, line, alone, beyond)
     marked = [_between(own, share, *ends) for ends in borders]
-    found, gone = beside_marked(narrowest(share, alone & again), marked)
+    found, gone = beside_marked(narrowest(share, alone, again), marked)
     spots = sorted([*marked, *found], key=lambda spot: float(share[spot[0]]))
     k, first, last = spots[0] if spots else (slightest(share, alone, again),) * 3
     for_good = clear & ~again & (share < 1 - LESION_SHARE)

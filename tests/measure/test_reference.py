@@ -6,6 +6,7 @@ import pytest
 from gcar_deploy.config import LesionBorders
 from gcar_deploy.measure.bifurcation import bifurcations
 from gcar_deploy.measure.borders import marked_lesions
+from gcar_deploy.measure.lesions import narrowest
 from gcar_deploy.measure.lumen import tree_lumens
 from gcar_deploy.measure.reference import FLOW_EXPONENT
 from gcar_deploy.measure.sections import sections_of_radii
@@ -222,6 +223,15 @@ def test_a_lesion_above_a_step_is_told_alone():
     assert lumen.minimal_at_mm == lesion.minimal_at_mm
     assert lumen.stenosis_percent == pytest.approx(53, abs=5)
     assert lumen.narrows_to_mm == pytest.approx(1.4, abs=0.1)
+
+
+def test_a_lesion_ends_where_the_vessel_is_wider_for_the_last_time():
+    share = np.array([1, 1, 0.8, 0.5, 0.7, 0.85, 0.6, 0.5, 0.4, 0.3])
+    clear = np.ones(len(share), bool)
+    again = np.arange(len(share)) < 5  # behind section 5 the vessel narrows for good
+    assert narrowest(share, clear, again) == [(3, 1, 5)]
+    assert [found[0] for found in narrowest(share, clear, clear)] == [9, 3]
+    assert narrowest(share, clear, ~clear) == []
 
 
 def test_a_lesion_at_the_end_recovers_in_the_branches_that_follow():
