@@ -3,11 +3,13 @@
 The rule, for each component by itself (a left and a right tree each have their own):
 
 0. the free end nearest to an ostium that a person marked, where one lies within ``MARKED_MM``;
-1. the ostium of the left main or right coronary artery, where anatomy names one
+1. where a vessel ends bluntly in a thin one (``measure.blunt``), ``BLUNTLY`` as wide as any free
+   end: a conus branch that seems to go on from the artery's beginning;
+2. the ostium of the left main or right coronary artery, where anatomy names one
    (``measure.naming``, with at least the probability that a name needs);
-2. else the thickest free end, its radius averaged over the last ``routes.END_MM`` mm: coronary
+3. else the thickest free end, its radius averaged over the last ``routes.END_MM`` mm: coronary
    arteries taper from the ostium on (Murray, Proc Natl Acad Sci 12:207, 1926);
-3. else, in a ring without a free end, the thickest node.
+4. else, in a ring without a free end, the thickest node.
 
 The last two look at radii and lengths alone, so that a mirrored or turned tree keeps its
 inlet.
@@ -15,10 +17,11 @@ inlet.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from gcar_deploy.measure.blunt import blunt_begins, parted
 from gcar_deploy.measure.naming import read_anatomy
 from gcar_deploy.measure.routes import end_radii
 from gcar_deploy.tree.rooted import rooted
@@ -30,6 +33,8 @@ _SAME_MM = 1e-6
 #: a marked ostium and the end of its artery may be so far apart: pictures seldom show the very
 #: mouth, and a click is off by a pixel or two
 MARKED_MM = 15.0
+#: a beginning that is no free end is so many times as thick as every free end
+BLUNTLY = 1.15
 #: arteries taper: a free end so many times as thick as a marked ostium is worth a word
 THICKER = 1.5
 
@@ -44,17 +49,33 @@ def from_inlets(tree: Tree, marked_mm: Points | None = None) -> Tree:
 
     Returns
     -------
-    Tree, see ``tree.rooted``
+    Tree, see ``tree.rooted``; with a node at an inlet within a branch
     """
-    return rooted(tree, inlets(tree, marked_mm))
+    tree, blunt = _parted_at_blunt(tree)
+    return rooted(tree, inlets(tree, marked_mm, blunt))
 
 
-def inlets(tree: Tree, marked_mm: Points | None = None) -> tuple[int, ...]:
-    """Node of the inlet of each component that has a branch, by the rule above."""
+def _parted_at_blunt(tree: Tree) -> tuple[Tree, set[int]]:
+    """Return the tree with a node at every blunt beginning that may be an inlet, and those."""
+    nodes: set[int] = set()
+    free, component = end_radii(tree), tree.components()
+    # The last ones first: parting a branch moves the numbers of those behind it.
+    for one in sorted(blunt_begins(tree), key=lambda one: (-one.branch, -one.point)):
+        own = component[tree.branches[one.branch].start]
+        if one.radius_mm > BLUNTLY * max(r for n, r in free.items() if component[n] == own):
+            tree, node = parted(tree, one)
+            nodes.add(node)
+    return tree, nodes
+
+
+def inlets(
+    tree: Tree, marked_mm: Points | None = None, blunt: Collection[int] = ()
+) -> tuple[int, ...]:
+    """Node of the inlet of each component that has a branch, by the rule above.
+
+    ``blunt``: nodes where a vessel begins bluntly.
+    """
     named = set(read_anatomy(tree).inlets)
-    free = end_radii(tree)
-    marked = {node for place in (() if marked_mm is None else marked_mm)
-              if (node := _end_at(tree, free, place)) is not None}  # fmt: skip
     thickest: dict[int, float] = {}
     for branch in tree.branches:
         for node, radius in (
@@ -62,11 +83,14 @@ def inlets(tree: Tree, marked_mm: Points | None = None) -> tuple[int, ...]:
             (branch.end, branch.radius_mm[-1]),
         ):
             thickest[node] = max(thickest.get(node, 0.0), float(radius))
+    free = {**end_radii(tree), **{node: thickest[node] for node in blunt}}
+    marked = {node for place in (() if marked_mm is None else marked_mm)
+              if (node := _end_at(tree, free, place)) is not None}  # fmt: skip
     component = tree.components()
     out = []
     for k in np.unique([component[node] for node in thickest]).tolist():
         own = [node for node in sorted(thickest) if component[node] == k]
-        known = ([n for n in own if n in wanted] for wanted in (marked, named, free))
+        known = ([n for n in own if n in wanted] for wanted in (marked, blunt, named, free))
         ends = next((found for found in known if found), [])
         radii = free if ends else thickest
         out.append(max(ends or own, key=lambda n: (round(radii[n] / _SAME_MM), -n)))

@@ -64,6 +64,8 @@ def handover_files(tree: Tree, drop: PressureDrop) -> tuple[dict[str, bytes], li
         notes.append(
             f"{', '.join(surface.left_round)} stays round, without a cap: a vessel is too near"
         )
+    if not any(name.startswith("inlet") for name in (*surface.names, *surface.left_round)):
+        notes.append("the artery begins where two vessels meet: the surface has no inlet to cut")
     skipped = len(tree.branches) - len(drop.network.order)
     if skipped:
         notes.append(f"{skipped} branches are not joined to an artery's inlet and are left out")

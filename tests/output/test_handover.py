@@ -15,6 +15,7 @@ from gcar_deploy.output.handover import handover_files
 from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.tree.surface import Surface
 from tests.flow.trees import drop_of, solved, stenosed, stenosed_fork
+from tests.measure.test_blunt import CONUS, artery
 from tests.measure.test_naming import left_tree
 
 
@@ -280,3 +281,12 @@ def test_the_picture_names_the_branches_without_a_value_at_their_far_end(made):
     wide = dataclasses.replace(others[-1], withheld="too wide")
     told = pressure_svg(dataclasses.replace(whole, vessels=(first, *others[:-1], wide)))
     assert f"no value at the far end of branch {len(drop.vessels)}<" in told
+
+
+def test_an_artery_that_begins_within_a_vessel_has_no_inlet_to_cut():
+    tree = from_inlets(artery(CONUS))
+    files, notes = handover_files(tree, drop_of(tree))
+    assert any("no inlet to cut" in note for note in notes)
+    model = json.loads(files["model_0d.json"])
+    flows = [b["bc_values"]["Q"][0] for b in model["boundary_conditions"] if b["bc_type"] == "FLOW"]
+    assert len(flows) == 2 and flows[0] > 5 * flows[1]  # the artery, and the conus branch
