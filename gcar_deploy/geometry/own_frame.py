@@ -21,7 +21,7 @@ from gcar_deploy.types import Points
 #: geometry nearer than this is the same geometry: mm, pixels, degrees; far below what any gantry
 #: or calibration tells, and above what arithmetic leaves of equal values
 GRAIN_DIGITS = 5
-#: views are put in order by their angles to so many digits, deg
+#: angles between views are compared to so many digits, deg
 ORDER_DIGITS = 2
 
 
@@ -83,18 +83,35 @@ def own_frame(carms: Sequence[CArm], names: Sequence[str]) -> OwnFrame:
     OwnFrame
         Its origin is the point nearest to all central rays: the isocentre, where all meet in it.
     """
-    order = sorted(
-        range(len(carms)),
-        key=lambda k: (
-            round(carms[k].primary_angle_deg, ORDER_DIGITS),
-            round(carms[k].secondary_angle_deg, ORDER_DIGITS),
-            names[k],
-        ),
-    )
+    order = _order(carms, names)
     origin = nearest_point(
         np.stack([carms[k].source_mm for k in order]), np.stack([carms[k].axes[2] for k in order])
     )
     return OwnFrame(tuple(order), origin, tuple(carms[k].sdd_mm for k in order))
+
+
+def _order(carms: Sequence[CArm], names: Sequence[str]) -> list[int]:
+    """Put views in order round the patient, from behind the widest gap between them.
+
+    Angles between views decide alone: one direction may be called 180 or -180 deg, and a turned
+    scene keeps its order. Views of one primary angle go by their secondary angles.
+    """
+    primary = np.array([carm.primary_angle_deg for carm in carms])
+
+    def beyond(start: int) -> list[float]:
+        """Angles from one view on to each, 0 .. 360."""
+        return (np.round((primary - primary[start]) % 360.0, ORDER_DIGITS) % 360.0).tolist()
+
+    def keys(start: int) -> list[tuple[float, float, str]]:
+        return [
+            (angle, round(carm.secondary_angle_deg, ORDER_DIGITS), name)
+            for angle, carm, name in zip(beyond(start), carms, names, strict=True)
+        ]
+
+    # The farther the last view is from the first, the narrower is what lies between them.
+    start = min(range(len(carms)), key=lambda k: (max(beyond(k)), keys(k)[k][1:]))
+    told = keys(start)
+    return sorted(range(len(carms)), key=told.__getitem__)
 
 
 def nearest_point(sources_mm: Points, directions: Points) -> Points:

@@ -27,8 +27,9 @@ from gcar_deploy.types import Array, Scalars
 
 #: points this far apart, mm, and how many of them a bend is measured over to each side
 _STEP_MM, _BEND = 1.0, 8
-#: shorter trees are parts, which may lie in any way
-_LEAST_MM = 80.0
+#: shorter trees are parts, which may lie in any way: of right arteries that end in an occlusion,
+#: about 100 mm long, a fifth was doubted
+_LEAST_MM = 120.0
 #: views with all secondary angles below this hardly tell a picture from its mirror image, deg
 _LEVEL_DEG = 10.0
 #: what a mistake does to the axes left, back and up, and the question that it is worth

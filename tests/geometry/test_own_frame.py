@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
@@ -79,3 +81,28 @@ def test_views_of_the_finest_and_the_widest_pixels_have_a_frame(pitch: float) ->
     for carm in carms:
         own = frame.carm(carm).project(POINTS - frame.origin_mm)
         np.testing.assert_allclose(own[0], carm.project(POINTS)[0], rtol=1e-6, atol=1e-4)
+
+
+def at(*angles: tuple[float, float]) -> list[CArm]:
+    return [view(*pair) for pair in angles]
+
+
+def test_one_direction_called_180_and_minus_180_has_one_place() -> None:
+    for there in (95.0, -95.0, 10.0):
+        orders = {own_frame(at((there, 5), (a, 20)), "ab").order for a in (180.0, -180.0)}
+        assert len(orders) == 1
+
+
+@given(st.floats(-180, 180), st.permutations(range(4)))
+def test_a_turned_scene_keeps_the_order_of_its_views(turn: float, order: list[int]) -> None:
+    angles = [(-60.0, 5.0), (-20.0, 30.0), (-20.0, -25.0), (70.0, 0.0)]
+    told = [((angles[k][0] + turn + 180) % 360 - 180, angles[k][1]) for k in order]
+    found = own_frame(at(*told), [str(k) for k in order]).order
+    assert [order[k] for k in found] == [0, 2, 1, 3]
+
+
+def test_the_last_digit_of_equal_angles_puts_no_view_first() -> None:
+    for angle in (10.005, 0.0, 180.0):
+        for off in (-1e-9, 0.0, 1e-9):
+            told = at((angle, 42.8), (min(angle + off, 180.0), -42.8))
+            assert own_frame(told, "ab").order == (1, 0)
