@@ -33,6 +33,7 @@ from gcar_deploy.measure import (
 from gcar_deploy.pose import landmark_pixels, marked_places, register
 from gcar_deploy.predict import Predictor, find_centers, quick_tree, seen_by_all
 from gcar_deploy.quality import (
+    OK,
     Part,
     Remark,
     check_candidates,
@@ -41,9 +42,12 @@ from gcar_deploy.quality import (
     check_length,
     check_tree,
     check_views,
+    doubted,
     judge,
+    kind_of,
 )
 from gcar_deploy.reconstruction import Reconstruction
+from gcar_deploy.second_look import check_second_look
 from gcar_deploy.steps import OnStep, Step
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.tree import Tree
@@ -175,6 +179,9 @@ def _reconstructed(
                 tree, placed.views, findings, options,
                 disagreement=placed.disagreement, evidence=centers.evidence,
             )  # fmt: skip
+            if judged.status == OK and kind_of(placed.views) != "exact":
+                why = check_second_look(tree, placed.views, grid, predictor, options, watch)
+                judged = judged if why is None else doubted(judged, tree, why)
         with watch.stage("diameters", keep_if_late=True):
             sections = measure_sections(tree, signals)
             tree = with_diameters(tree, sections)

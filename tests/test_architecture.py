@@ -30,7 +30,7 @@ RUNTIME_FLOORS = (
     "predict tubes measure",
     "quality flow",
     "pose",
-    "reconstruction steps",
+    "reconstruction steps second_look",
     "output reconstruct selftest data",
     "result",
     "engine",

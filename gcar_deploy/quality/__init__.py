@@ -24,9 +24,11 @@ from gcar_deploy.quality.ghosts import (
 from gcar_deploy.quality.gravity import Part, Remark
 from gcar_deploy.quality.scale import check_gross_scale
 from gcar_deploy.quality.status import (
+    OK,
     Quality,
     ViewQuality,
     check_explained,
+    doubted,
     judge,
     part_lengths_mm,
     unexplained,
@@ -36,6 +38,7 @@ from gcar_deploy.quality.too_much import check_found, check_length
 __all__ = [
     "FIGURES",
     "GHOST_MM",
+    "OK",
     "PROBABLE",
     "GhostModel",
     "Part",
@@ -56,6 +59,7 @@ __all__ = [
     "check_tree",
     "check_views",
     "disagreement_limits",
+    "doubted",
     "ghost_share",
     "judge",
     "kind_of",

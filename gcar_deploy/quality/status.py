@@ -262,6 +262,13 @@ def check_explained(
     return findings
 
 
+def doubted(judged: Quality, tree: Tree, finding: str) -> Quality:
+    """Return a judgement with one more reason for ``degraded``."""
+    findings = gravest_first([*judged.findings, Part(finding)])
+    sentence = _sentence(findings, tree, len(judged.views))
+    return dataclasses.replace(judged, status=DEGRADED, sentence=sentence, findings=findings)
+
+
 def _sentence(findings: Sequence[str], tree: Tree, count: int) -> str:
     if not findings:
         checked = _CHECKED + (_OF_TWO if count == 2 else _OF_MORE)
