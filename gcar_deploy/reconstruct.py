@@ -56,7 +56,7 @@ from gcar_deploy.tubes import refine, refined_volume
 #: stages with their usual share of the time
 STAGES = (
     ("vessels", 3.0), ("pose", 2.0), ("candidates", 1.0), ("centers", 2.0), ("refine", 6.0),
-    ("quality", 0.5), ("diameters", 0.5), ("tree", 1.0),
+    ("quality", 2.0), ("diameters", 0.5), ("tree", 1.0),
 )  # fmt: skip
 
 

@@ -126,7 +126,8 @@ def register(
         lone = one.uncovered_mm
         findings += check_asked(ids, one.given, turn, scale, options.quality, lone)
     moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
-    findings += check_poses(views, moves, options.quality)
+    offsets = [pose.offset_mm for pose in poses]
+    findings += check_poses(views, moves, options.quality, offsets)
     findings += _unfinished(views, poses) + _marked_apart(views, poses)
     after, partners = [pose.after for pose in poses], [pose.partner for pose in poses]
     refusal = ""

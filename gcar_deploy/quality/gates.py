@@ -19,6 +19,7 @@ from gcar_deploy.geometry.consistency import uncovered_mm as uncovered
 from gcar_deploy.geometry.consistency import vessel_mass
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
+from gcar_deploy.quality.along_beam import along_a_beam
 from gcar_deploy.quality.duplicates import check_duplicates
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Scalars
@@ -223,6 +224,7 @@ def check_poses(
     views: Sequence[VesselImage],
     corrections: Sequence[tuple[float, float]],
     options: QualityOptions,
+    offsets_mm: Sequence[Sequence[float]] = (),
 ) -> list[str]:
     """Judge the estimated corrections between the runs.
 
@@ -230,17 +232,20 @@ def check_poses(
     ----------
     views : V vessel images
     corrections : (V,) shift in mm and larger turn in deg of each view
+    offsets_mm : (V, 3) the shifts themselves, where they are known
     """
     findings = []
     hidden = ": the same move within the plane of the beams would leave no trace"
     # Exact profiles agree to a part in a hundred, and a cut vessel takes more from one of them.
     cut = [view.view_id for view in views if view.calibrated and is_cut(view)]
-    for view, (shift, turn) in zip(views, corrections, strict=True):
+    for number, (view, (shift, turn)) in enumerate(zip(views, corrections, strict=True)):
         if shift > options.good_shift_mm or turn > options.good_turn_deg:
             findings.append(
                 f"view {view.view_id} had to be moved by {shift:.1f} mm and turned by "
                 f"{turn:.1f} deg to agree (up to {options.good_shift_mm:g} mm and "
-                f"{options.good_turn_deg:g} deg are usual)" + (hidden if len(views) == 2 else "")
+                f"{options.good_turn_deg:g} deg are usual)"
+                + (along_a_beam(views, offsets_mm[number]) if offsets_mm else "")
+                + (hidden if len(views) == 2 else "")
             )
         elif shift > CUT_SHIFT_MM and view.calibrated and cut:
             findings.append(

@@ -154,6 +154,22 @@ def test_a_large_correction_between_the_runs_is_degraded(case):
         assert "view 2 had to be moved" in finding
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_shift_along_a_beam_asks_for_that_views_scale(case, number):
+    views = case[1]
+    beam = views[number].carm.axes[2]
+    aside = np.cross(beam, views[1 - number].carm.axes[2])
+    for offset, asks in ((-40 * beam, True), (40 * aside, False), (9 * beam, False)):
+        moves = [(0.0, 0.0), (float(np.linalg.norm(offset)), 0.0)]
+        (finding,) = check_poses(views, moves, OPTIONS, [np.zeros(3), offset])
+        assert ("SOD" in finding) == asks
+        share = 40 / views[number].carm.sod_mm
+        said = f"beam of view {number + 1}, as where"
+        assert (said in finding and f"some {share:.0%} off" in finding) == asks
+    (alone,) = check_poses(views, moves, OPTIONS)
+    assert "SOD" not in alone
+
+
 def filled(view, ml, line_mm, kind="raw"):
     """Return a view with so much vessel, in rows of a comb."""
     pixel = view.carm.pixel_at_isocenter_mm
