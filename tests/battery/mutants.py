@@ -301,7 +301,7 @@ MUTANTS = (
     Mutant(
         "names: the ostium that anatomy names is not the inlet",
         "gcar_deploy/measure/inlet.py",
-        "for wanted in (marked, named, free))",
+        "for wanted in (marked, blunt, named, free))",
         "for wanted in (marked, (), free))",
         ("tests/measure/test_inlet.py",),
     ),
