@@ -78,3 +78,20 @@ def test_without_time_it_is_said_that_nobody_looked_and_cancelled_is_cancelled(m
     )
     with pytest.raises(CancelledError):
         check_second_look(tree, *how, Stopwatch(STAGES, cancel=lambda: True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "status"), [(7, "degraded"), (14, "ok")])
+def test_vessels_that_were_exchanged_in_masks_are_not_ok(number, status):
+    """F at 2 mm of both trees is 76 and 98 %; expected ghosts are 8 and 5 %, which say neither."""
+    pytest.importorskip("torch", reason="needs the export extra")
+    from gcar_export.scenes.protocols import case_geometry
+    from gcar_export.studies.gate_pairs import generated_subject, make_pair
+
+    subject = generated_subject(650_003, number, "left")
+    pair = make_pair(subject, subject, "same", "left mask", 650_003)
+    result = Engine(threads=1).reconstruct(pair.angiograms, case_geometry("clinical", 2)[1])
+    assert result.status == status, result.quality.findings
+    assert [said.startswith("made again of") for said in result.quality.findings] == (
+        [True] if status == "degraded" else []
+    )

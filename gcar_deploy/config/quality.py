@@ -84,8 +84,8 @@ class QualityOptions:
     #: before, and no more of the good: of generated pairs, and of the real ones looked at
     good_ghost_share: Share = 0.1
     #: share of a tree that lies elsewhere once the scene is turned (``second_look``). Of generated
-    #: masks that were ``ok`` three trees were at 0.14 and more, F at 2 mm 76 to 89 %, all others at
-    #: most at 0.065, F 94 % and more
+    #: masks that were ``ok`` three of 27 were at 0.14 and more, F at 2 mm 76 to 89 %, the others at
+    #: most at 0.083, F 91 % and more
     good_second_look: Share = 0.1
     #: a larger estimated correction between the runs is no small matter of breath or table
     good_shift_mm: Length = 5.0
