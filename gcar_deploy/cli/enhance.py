@@ -88,6 +88,7 @@ def enhance(
     for note in notes:
         say(f"gcar: {note}")
     pictures: dict[str, bytes] = {}
+    told: list[str] = []
     for who in ("classic", "net") if segmenter == "both" else (segmenter,):
         chosen = dataclasses.replace(options, segmenter=who)
         network, missing = asked_network(
@@ -98,13 +99,15 @@ def enhance(
         found = extract_vessels(angiogram, chosen, network)
         prefix = "net_" if (segmenter, who) == ("both", "net") else ""
         pictures |= {prefix + name: p for name, p in png_files(found).items()}
+        length_mm = float(arc_length(found.skeleton).sum()) * found.carm.pixel_at_isocenter_mm
+        told.append(
+            f"{out}: {prefix}vesselness.png, {prefix}mask.png ({found.mask.mean():.1%} of the "
+            f"picture), {prefix}skeleton.png (about {length_mm:.0f} mm), {prefix}steps.png "
+            f"({found.catheter_mm:.0f} mm taken for catheter)"
+        )
     write_folder(out, pictures, force=order.force)
-    length_mm = float(arc_length(found.skeleton).sum()) * found.carm.pixel_at_isocenter_mm
-    click.echo(
-        f"{out}: vesselness.png, mask.png ({found.mask.mean():.1%} of the picture), "
-        f"skeleton.png (about {length_mm:.0f} mm), steps.png ({found.catheter_mm:.0f} mm taken "
-        "for catheter)"
-    )
+    for line in told:
+        click.echo(line)
 
 
 def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]]:

@@ -249,6 +249,24 @@ def test_enhance_masks_as_run_does_or_says_what_it_takes_for_a_pixel(tmp_path):
     assert guessed.code == 0 and "150 mm" in guessed.err and "--pixel-mm" in guessed.err
 
 
+def test_enhance_tells_each_methods_own_files(tmp_path):
+    """Both methods at once say what each alone says, under the names that its files have."""
+    clean = cv2.imread(str(demo_case().pictures[0]), cv2.IMREAD_GRAYSCALE)
+    grain = np.random.default_rng(0).normal(0, 4, clean.shape)
+    # Uneven, so that the network is asked.
+    ground = 150 + 25 * np.sin(np.arange(clean.shape[1]) / 40)
+    cv2.imwrite(str(tmp_path / "raw.png"), (ground - 2.0 * clean + grain).astype(np.uint8))
+    out, look = tmp_path / "a", ("enhance", tmp_path / "raw.png")
+    both = gcar(*look, "--segmenter", "both", "--out", out).out.splitlines()
+    assert len(both) == 2
+    for who, prefix, line in zip(("classic", "net"), ("", "net_"), both, strict=True):
+        alone = gcar(*look, "--segmenter", who, "--out", out, "--force").out
+        for name in ("vesselness", "mask", "skeleton", "steps"):
+            alone = alone.replace(f"{name}.png", f"{prefix}{name}.png")
+        assert line == alone.strip()
+    assert both[0].replace("net_", "") != both[1].replace("net_", "")
+
+
 def test_doctor_passes_its_self_test():
     # Other tests of this process may have imported torch before.
     before = "torch" in sys.modules
