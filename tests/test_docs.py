@@ -57,6 +57,13 @@ def test_links_lead_somewhere(page):
         assert "://" in target or (page.parent / target).exists(), target
 
 
+def test_the_demo_promises_no_table(tool):
+    """One line compares its tree with the truth; ``gcar bench`` has the table."""
+    help_of = {name: command.help or "" for name, command in tool.commands()}
+    told = " ".join(help_of["gcar demo"].split())
+    assert "a line says how well the tree and the truth" in told and "table" not in told
+
+
 def test_every_exit_code_is_explained():
     from gcar_deploy import errors
 

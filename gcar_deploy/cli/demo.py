@@ -18,7 +18,7 @@ from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.inputs.order import Order
 
 _FOLDER = Path("gcar-demo")
-#: measures that the table for people holds
+#: measures that people are told
 _SHOWN = ("dsc", "ot_1mm", "chamfer_mm")
 
 
@@ -29,8 +29,8 @@ _SHOWN = ("dsc", "ot_1mm", "chamfer_mm")
 def demo(order: Order, engine: EngineChoice, talk: Talk) -> None:
     """Reconstruct a real patient's left coronary tree from two simulated pictures.
 
-    The folder holds the pictures to look at (overlay_view1.png, report.html); the table
-    compares the tree with the truth that the pictures were made from. The folder is gcar-demo
+    The folder holds the pictures to look at (overlay_view1.png, report.html); a line says how
+    well the tree and the truth that the pictures were made from agree. The folder is gcar-demo
     unless --out names another; an earlier demo in it is replaced.
 
     \b
