@@ -141,7 +141,7 @@ class Reconstruction:
 
     @property
     def ghost_probability(self) -> tuple[Scalars, ...]:
-        """Per branch (m,) probability that the vessel is not there; NaN where it is not known."""
+        """Per branch (m,) probability of lying more than 2 mm from any vessel; NaN: not known."""
         ghosts = self.quality.ghosts
         if ghosts is None:
             return tuple(np.full(len(branch), np.nan) for branch in self.tree.branches)

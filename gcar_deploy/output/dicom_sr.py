@@ -16,6 +16,7 @@ import numpy as np
 
 from gcar_deploy.errors import UsageError
 from gcar_deploy.output.stored import Stored
+from gcar_deploy.output.words import GHOST
 from gcar_deploy.tree.tree import Branch
 
 _TITLE = "Coronary measurements, research use only"
@@ -110,7 +111,7 @@ def _group(stored: Stored, k: int, frame: str, runs: Sequence[Any]) -> Any:
         _number(sct.StenoticLesionLength, row["lesion_length_mm"] or None, "mm"),
         _number(sct.LengthOfVesselSegment, row["length_mm"], "mm"),
         _number(_reference(), row["reference_diameter_mm"], "mm"),
-        _number(_own("GHOST", "Probability that the branch is not there"),
+        _number(_own("GHOST", GHOST.capitalize()),
                 _percent(row.get("ghost_probability")), "%"),
         _number(_own("NAME", "Probability of the name of the vessel"),
                 _percent(row.get("name_confidence")), "%"),

@@ -90,7 +90,7 @@ def overlay(
     view : what was found in the picture, with the C-arm as it was used (pose applied)
     tree : Tree
     judged : ViewQuality, for the label
-    ghosts : per branch (m,) probability that the vessel is not there; probable ghosts are dashed
+    ghosts : per branch (m,) ``ghost_probability``; probable ghosts are dashed
 
     Returns
     -------

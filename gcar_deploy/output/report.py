@@ -18,7 +18,7 @@ from gcar_deploy.errors import GcarError
 from gcar_deploy.output.colors import SCALE, css
 from gcar_deploy.output.pressure_plot import pressure_svg
 from gcar_deploy.output.report_data import scene_data
-from gcar_deploy.output.words import LEFT_OUT, explained
+from gcar_deploy.output.words import GHOST, LEFT_OUT, explained
 from gcar_deploy.reconstruction import Reconstruction
 from gcar_deploy.tree.rooted import inlet_arcs
 from gcar_deploy.types import Array
@@ -72,6 +72,7 @@ def report_html(
                 summary["tree"]["branches"], result.measured.hidden.tolist(), far_mm, strict=True
             )
         ),
+        "GHOST": GHOST,
         "LESIONS": _lesions(summary["tree"]["branches"], far_mm),
         "PRESSURE": pressure_rows(summary),
         "ASSUMED": html.escape(summary["pressure"]["sentence"]),

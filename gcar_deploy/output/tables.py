@@ -87,7 +87,7 @@ def centerline_vtp(tree: Tree, measured: Measured, ghosts: Sequence[Scalars]) ->
     """XML PolyData, one polyline per branch, mm LPS, for VMTK and 3D Slicer.
 
     A branch without a name has an empty ``VesselName`` and no (NaN) ``NameConfidence``. ``ghosts``
-    are per branch (m,) probabilities that the vessel is not there, NaN where they are not known.
+    are per branch (m,) probabilities of lying more than 2 mm from any vessel, NaN: not known.
     Covariances are mm^2 LPS in the order xx, yy, zz, xy, yz, xz; the whole one is the sum of both.
     """
     sizes = [len(branch) for branch in tree.branches]

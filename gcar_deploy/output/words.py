@@ -6,6 +6,8 @@ from __future__ import annotations
 LEAST_LEFT_OUT = 0.02
 #: the grey of a picture: a line that the other views do not show may as well be a vessel
 LEFT_OUT = "left out: catheter, wire, or vessel without a partner"
+#: what the figure of a ghost means for a whole branch: a mean over its length
+GHOST = "share of the branch expected more than 2 mm from any vessel"
 
 
 def explained(coverage: float | None, even: float | None, left_out: float) -> str:

@@ -43,7 +43,7 @@ export function table(store, erase) {
     el("thead", {}, el("tr", {}, ...COLUMNS.map(([name, unit], k) => el("th", { scope: "col" }, name || (k === 9 ? el("span", { class: "swatch", hidden: true }) : "\u00a0"), el("small", {}, unit))))),
     el("tbody", {}, ...rows));
   more();
-  $("lesion-note").textContent = "Bold: narrower by half or more. Reference: healthy diameter at the narrowing, by a line through the wider parts. Ghost: probability that the branch is not there; dashed from a half on.";
+  $("lesion-note").textContent = "Bold: narrower by half or more. Reference: healthy diameter at the narrowing, by a line through the wider parts. Ghost: share of the branch expected more than 2 mm from any vessel; dashed where it is probably one.";
 }
 
 /** Say what is not listed, and offer it. */
