@@ -68,9 +68,11 @@ def tradeoff_svg(
                'fill="none" stroke="#555"/>')  # fmt: skip
     out.append(_text((LEFT + right) / 2, HEIGHT - 20, "seconds per reconstruction, warm", "middle"))
     out.append(_upright(20, (TOP + bottom) / 2, "centreline error (RMS), mm"))
+    bounded = False
     if bound_mm:
         out.append(_upright(right + 52, (TOP + bottom) / 2, "error / Cramér-Rao bound"))
-        if y_ticks[0] < bound_mm < y_ticks[-1]:
+        bounded = y_ticks[0] < bound_mm < y_ticks[-1]
+        if bounded:
             out.append(_line(LEFT, sy(bound_mm), right, sy(bound_mm), "#777", dash="2 4"))
     if len(front) > 1:
         path = " ".join(f"{sx(p.seconds):.1f},{sy(p.error_mm):.1f}" for p in front)
@@ -83,20 +85,22 @@ def tradeoff_svg(
             f'fill="{colour[p.series]}" fill-opacity="0.8"><title>{escape(p.text)}</title></circle>'
         )
     if knee is not None:
-        out += _knee(sx(knee.seconds), sy(knee.error_mm), right)
-    out += _legend(names, colour, right + 86)
+        out.append(_ring(sx(knee.seconds), sy(knee.error_mm), 10))
+    out += _legend(names, colour, right + 86, bound=bounded, knee=knee is not None)
     return "\n".join([*out, "</svg>", ""])
 
 
-def _knee(x: float, y: float, right: float) -> list[str]:
-    side, anchor = (14, "start") if x < 0.6 * right else (-14, "end")
-    return [
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="10" fill="none" stroke="#000" stroke-width="2"/>',
-        _text(x + side, y - 12, "more work buys nothing past here", anchor),
-    ]
+def _ring(x: float, y: float, radius: float) -> str:
+    return (
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="none" stroke="#000" '
+        'stroke-width="2"/>'
+    )
 
 
-def _legend(names: Sequence[str], colour: dict[str, str], x: float) -> list[str]:
+def _legend(
+    names: Sequence[str], colour: dict[str, str], x: float, *, bound: bool, knee: bool
+) -> list[str]:
+    """Say what points, lines and the ring are, beside the chart: within it words lie on points."""
     out = [_text(x - 5, TOP + 10, "predictor + refiner", "start")]
     for k, name in enumerate(names):
         y = TOP + 34 + 22 * k
@@ -105,6 +109,15 @@ def _legend(names: Sequence[str], colour: dict[str, str], x: float) -> list[str]
     y = TOP + 40 + 22 * len(names)
     out.append(_line(x - 6, y - 4, x + 8, y - 4, "#444", dash="6 4"))
     out.append(_text(x + 12, y, "Pareto front", "start"))
+    if bound:
+        y += 22
+        out.append(_line(x - 6, y - 4, x + 8, y - 4, "#777", dash="2 4"))
+        out.append(_text(x + 12, y, "Cramér-Rao bound", "start"))
+    if knee:
+        y += 22
+        out.append(_ring(x + 1, y - 4, 7))
+        out.append(_text(x + 12, y, "more work buys", "start"))
+        out.append(_text(x + 12, y + 16, "nothing past here", "start"))
     return out
 
 

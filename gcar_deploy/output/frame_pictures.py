@@ -13,7 +13,9 @@ from gcar_deploy.output.overlay import grey8, png_bytes
 from gcar_deploy.types import Array, Image
 
 _FONT, _INK = cv2.FONT_HERSHEY_SIMPLEX, (40, 40, 40)
-_SIDE, _LEFT, _TOP, _BELOW, _GAP = 512, 96, 48, 72, 32
+_SIDE, _LEFT, _TOP, _BELOW, _GAP = 512, 96, 48, 92, 32
+#: why a pair was not to be taken: see ``choose_pair``
+_PALE = "pale: not filled, not still, no R wave, or not the frame asked for"
 #: width of the colour scale and of its labels
 _SCALE = 110
 
@@ -44,7 +46,14 @@ def pairs_png(
     n, m = pair.scores.shape
     cell = max(2, min(_SIDE // n, _SIDE // m))
     height, width = n * cell, m * cell
-    canvas = np.full((_TOP + max(height, _SIDE) + _BELOW, _LEFT + width + _SCALE, 3), 255, np.uint8)
+    margin = "-" if pair.margin is None else f"{pair.margin:.2f}"
+    i, j = pair.chosen
+    said = [f"frames {i + 1} and {j + 1}: score {pair.score:.2f}, margin {margin}"]
+    if not pair.remaining.all():
+        said.append(_PALE)
+    # Runs of few frames make a narrow table; words stand below it whole.
+    wide = max(_LEFT + width + _SCALE, _LEFT + max(map(_width, said)) + _GAP)
+    canvas = np.full((_TOP + max(height, _SIDE) + _BELOW, wide, 3), 255, np.uint8)
     low, high = float(pair.scores.min()), float(pair.scores.max())
     shade = np.rint(255 * (pair.scores - low) / max(high - low, 1e-9)).astype(np.uint8)
     colour = cv2.applyColorMap(shade, cv2.COLORMAP_VIRIDIS)
@@ -53,7 +62,6 @@ def pairs_png(
     canvas[_TOP : _TOP + height, _LEFT : _LEFT + width] = cv2.resize(
         colour, (width, height), interpolation=cv2.INTER_NEAREST
     )
-    i, j = pair.chosen
     at = (_LEFT + j * cell, _TOP + i * cell)
     cv2.rectangle(canvas, at, (at[0] + cell, at[1] + cell), (0, 0, 255), 2)
     for k in _ticks(m):
@@ -63,9 +71,8 @@ def pairs_png(
     _write(canvas, _axis("run 2: frame", frame_ms[1]), (_LEFT, _TOP + height + 42))
     _write(canvas, _axis("run 1: frame (down)", frame_ms[0]), (_LEFT, _TOP - 12))
     _scale(canvas, (_LEFT + width + 16, _TOP, height), (low, high))
-    margin = "-" if pair.margin is None else f"{pair.margin:.2f}"
-    said = f"frames {i + 1} and {j + 1}: score {pair.score:.2f}, margin {margin}"
-    _write(canvas, said, (_LEFT, _TOP + height + 64))
+    for k, text in enumerate(said):
+        _write(canvas, text, (_LEFT, _TOP + height + 64 + 20 * k))
     parts = [canvas]
     for number, (picture, frame) in enumerate(zip(pictures, (i, j), strict=True), start=1):
         parts.append(_framed(picture, f"run {number}, frame {frame + 1}", canvas.shape[0]))
@@ -99,6 +106,10 @@ def _axis(text: str, frame_ms: float | None) -> str:
 def _ticks(count: int) -> list[int]:
     step = max(1, -(-count // 10))
     return list(range(1, count + 1, step))
+
+
+def _width(text: str) -> int:
+    return int(cv2.getTextSize(text, _FONT, 0.5, 1)[0][0])
 
 
 def _write(canvas: Array, text: str, at: tuple[int, int]) -> None:

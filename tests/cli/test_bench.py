@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from gcar_deploy.bench import tradeoff as benchmark
+from gcar_deploy.bench.chart import RIGHT, WIDTH, Point, tradeoff_svg
 from gcar_deploy.bench.tradeoff import Cell, Row, at_size, front, knee
 from gcar_deploy.cli.bench import COLUMNS, _csv, chart
 from tests.cli.conftest import gcar
@@ -46,6 +47,27 @@ def test_table_and_picture_hold_every_cell():
         and "more work" in words
         and "predictor + refiner" in words
     )
+
+
+def test_the_chart_explains_ring_and_dotted_line_beside_itself():
+    """Words within it would lie on points; nothing is explained that is not drawn."""
+    points = [Point(seconds=s, error_mm=e, series="a") for s, e in ((1, 2), (2, 1), (9, 0.9))]
+
+    def drawn(knee, bound_mm):
+        made = tradeoff_svg(points, points[:2], knee, title="t", bound_mm=bound_mm)
+        svg, space = ET.fromstring(made), "{http://www.w3.org/2000/svg}"  # noqa: S314 - our own
+        words = {t.text: float(t.get("x")) for t in svg.iter(f"{space}text")}
+        rings = sum(c.get("fill") == "none" for c in svg.iter(f"{space}circle"))
+        dotted = sum(one.get("stroke-dasharray") == "2 4" for one in svg.iter(f"{space}line"))
+        return words, rings, dotted
+
+    words, rings, dotted = drawn(points[1], 1.2)
+    assert (rings, dotted) == (2, 2)  # in the chart, and what it means
+    for told in ("more work buys", "nothing past here", "Cramér-Rao bound"):
+        assert words[told] > WIDTH - RIGHT
+        assert words[told] + 7.5 * len(told) < WIDTH
+    words, rings, dotted = drawn(None, None)
+    assert (rings, dotted) == (0, 0) and not {"more work buys", "Cramér-Rao bound"} & words.keys()
 
 
 def test_the_grid_varies_every_axis():
