@@ -23,7 +23,7 @@ _TEMPLATE = "summary_template.html"
 _SHOWN = (
     ("status", "Status", "", None), ("branches", "Branches", "", 0),
     ("length_mm", "Length", "mm", 0), ("separation_deg", "View separation", "deg", 0),
-    ("least_coverage", "Least coverage", "%", 0),
+    ("least_coverage", "Least coverage", "% weighed by thickness", 0),
     ("largest_stenosis_percent", "Largest stenosis", "%", 0), ("seconds", "Time", "s", 1),
     ("sentence", "Why", "", None),
 )  # fmt: skip

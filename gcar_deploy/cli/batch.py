@@ -61,7 +61,8 @@ def batch(table: Path, order: Order, where: Where, engine: EngineChoice, talk: T
     (C1,R1:C2,R2, several apart by spaces), pixel_spacing_mm, sod_mm, segmenter, predictor, refiner,
     pose, deadline_s.
 
-    Writes a result folder a case, summary.csv and summary.html. A case that fails is a row
+    Writes a result folder a case, summary.csv and summary.html; their least coverage is that of
+    the view of which least is explained, weighed by thickness. A case that fails is a row
     with its reason and never stops the rest; the same command goes on where it was stopped, and
     runs changed and failed cases again with --force. Exit code 0 when the table is done, whatever
     became of its cases.

@@ -44,6 +44,13 @@ def browse(chromium, tmp_path):
     assert complaints == []
 
 
+def test_the_least_coverage_says_by_what_it_is_weighed(tmp_path):
+    """Of the two shares that a run tells; on a telephone as well, which has no heading."""
+    page = summary_html([{**error_row("a", "ok", "why", 0), "least_coverage": 0.9}], tmp_path)
+    assert "Least coverage</button><small>% weighed by thickness</small>" in page
+    assert 'data-name="Least coverage, % weighed by thickness" data-value="90"' in page
+
+
 def cases(page):
     return [cell.inner_text() for cell in page.locator("tbody tr:visible td.name").all()]
 
