@@ -35,8 +35,14 @@ _AROUND = tuple((dx, dy) for dx in (-2, -1, 0, 1, 2) for dy in (-2, -1, 0, 1, 2)
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # OpenCV 4.12 or newer
     _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
-#: branches shorter than this on the screen get no number, numbers keep this distance, pixels
-_NUMBER_GAP = 30
+#: branches shorter than this on the screen get no number, pixels
+_LEAST_NUMBERED = 30
+#: where along its branch a number may stand, shares of its length, the first with room
+_ALONG = (0.5, 0.35, 0.65, 0.2, 0.8, 0.1, 0.9)
+#: how dark the legend's plate makes what lies under it
+_PLATE = 0.3
+#: left, top, right, bottom of a part of the picture, pixels
+Box = tuple[int, int, int, int]
 
 
 def grey8(pixels: Image) -> Array:
@@ -116,10 +122,11 @@ def overlay(
         for dash in _gaps(line, 4 * width):
             points = np.rint(dash * 2**_SHIFT).astype(np.int32)
             cv2.polylines(canvas, [points], False, _BLACK, width + 1, cv2.LINE_8, _SHIFT)
-    _numbers(canvas, lines)
-    _labels(canvas, judged)
     device = view.catheter is not None and bool(view.catheter.any())
-    _legend(canvas, view.carm.pixel_at_isocenter_mm / zoom, bool(doubtful), device)
+    taken = _labels(canvas, judged)
+    taken.append(_legend(canvas, lines, taken[-1][3], bool(doubtful), device))
+    taken.append(_scale_bar(canvas, view.carm.pixel_at_isocenter_mm / zoom))
+    _numbers(canvas, lines, taken)
     return canvas
 
 
@@ -168,37 +175,65 @@ def _mark(canvas: Array, missing: Mask, zoom: int, color: tuple[int, int, int]) 
     canvas[big > 0] = color
 
 
-def _numbers(canvas: Array, lines: list[Pixels]) -> None:
-    """Write the number of each branch beside its middle, where there is room."""
-    scale = max(canvas.shape[1] / 1500, 0.5)
-    taken: list[Pixels] = []
+def _numbers(canvas: Array, lines: list[Pixels], taken: Sequence[Box]) -> None:
+    """Write the number of each branch beside it, in or near its middle, where there is room."""
+    rows, columns = canvas.shape[:2]
+    scale = max(columns / 1500, 0.5)
+    boxes, gap, high = list(taken), round(8 * scale), round(22 * scale)
     for number, line in enumerate(lines):
-        if len(line) < 2 or np.ptp(line, axis=0).max() < _NUMBER_GAP:
+        if len(line) < 2 or np.ptp(line, axis=0).max() < _LEAST_NUMBERED:
             continue
-        at = line[len(line) // 2]
-        if any(np.linalg.norm(at - other) < _NUMBER_GAP * 2 * scale for other in taken):
-            continue
-        taken.append(at)
-        place = (round(at[0]) + 8, round(at[1]) - 6)
-        _text(canvas, str(number + 1), place, scale, branch_color(number))
+        text = str(number + 1)
+        wide = _width(text, scale)
+        for share in _ALONG:
+            at = line[round(share * (len(line) - 1))]
+            x, y = round(at[0]) + 8, round(at[1]) - 6
+            box = (x - gap, y - high - gap, x + wide + gap, y + gap)
+            inside = box[0] >= 0 and box[1] >= 0 and box[2] <= columns and box[3] <= rows
+            if inside and not any(_meet(box, other) for other in boxes):
+                boxes.append((x, y - high, x + wide, y))
+                _text(canvas, text, (x, y), scale, branch_color(number))
+                break
 
 
-def _labels(canvas: Array, judged: ViewQuality) -> None:
+def _meet(one: Box, other: Box) -> bool:
+    return (
+        one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+    )  # fmt: skip
+
+
+def _labels(canvas: Array, judged: ViewQuality) -> list[Box]:
+    """Write at the top left which view it is and how much of it is explained; where."""
     size = max(canvas.shape[1] / 1000, 0.6)
-    _text(canvas, f"View {judged.view_id}: {judged.name}", (14, round(34 * size)), size)
+    title = f"View {judged.view_id}: {judged.name}"
+    _text(canvas, title, (14, round(34 * size)), size)
+    boxes = [(0, 0, 14 + _width(title, size), round(42 * size))]
     if judged.coverage is not None:
         text = explained(judged.coverage, judged.coverage_even, judged.left_out)
         _text(canvas, text, (14, round(62 * size)), 0.7 * size)
+        boxes.append((0, boxes[0][3], 14 + _width(text, 0.7 * size), round(70 * size)))
+    return boxes
 
 
-def _legend(canvas: Array, pixel_mm: float, dashed: bool, device: bool) -> None:
-    """Scale bar at the bottom left, meaning of the colours at the bottom right."""
+def _scale_bar(canvas: Array, pixel_mm: float) -> Box:
+    """Draw it at the bottom left; where."""
     rows, columns = canvas.shape[:2]
     size = max(columns / 1600, 0.5)
     x, y, width = 14, rows - 16, max(2, round(_BAR_MM / pixel_mm))
     cv2.line(canvas, (x, y), (x + width, y), _BLACK, 6, cv2.LINE_AA)
     cv2.line(canvas, (x, y), (x + width, y), _WHITE, 2, cv2.LINE_AA)
-    _text(canvas, f"{_BAR_MM} mm at the isocentre", (x, y - round(20 * size)), size)
+    text = f"{_BAR_MM} mm at the isocentre"
+    _text(canvas, text, (x, y - round(20 * size)), size)
+    return 0, y - round(46 * size), x + max(width, _width(text, size)), rows
+
+
+def _legend(canvas: Array, lines: list[Pixels], below: int, dashed: bool, device: bool) -> Box:
+    """Say what the colours mean, at the right where fewer branches lie, on a dark plate; where.
+
+    ``below`` is where the words at the top end.
+    """
+    rows, columns = canvas.shape[:2]
+    size = max(columns / 1600, 0.5)
     entries = [("centreline, a colour a branch", branch_color(0)), ("vessel not explained", _RED)]
     if dashed:
         entries.insert(1, ("dashed: probably not there", branch_color(0)))
@@ -206,15 +241,27 @@ def _legend(canvas: Array, pixel_mm: float, dashed: bool, device: bool) -> None:
         entries.append((LEFT_OUT, _DEVICE))
     step = round(34 * size)
     wide = max(_width(text, size) for text, _ in entries)
+    left = max(columns - 14 - wide, 0)
+    high = step * len(entries) + round(12 * size)
+    # The last line's foot stands 16 pixels above the border.
+    corners = [rows - 8 - high, min(below, rows - 8 - high)]
+    boxes: list[Box] = [(max(left - 54, 0), max(y, 0), columns - 6, y + high) for y in corners]
+    x0, y0, x1, y1 = min(boxes, key=lambda box: _points_in(lines, box))
+    canvas[y0:y1, x0:x1] = (canvas[y0:y1, x0:x1] * _PLATE).astype(np.uint8)
     for k, (text, color) in enumerate(entries):
-        row = rows - 16 - step * (len(entries) - 1 - k)
-        left = columns - 14 - wide
+        row = y1 - 8 - step * (len(entries) - 1 - k)
         middle = row - round(9 * size)
         cv2.line(canvas, (left - 44, middle), (left - 12, middle), _BLACK, 6, cv2.LINE_AA)
         cv2.line(canvas, (left - 44, middle), (left - 12, middle), color, 3, cv2.LINE_AA)
         if text.startswith("dashed"):
             cv2.line(canvas, (left - 33, middle), (left - 23, middle), _BLACK, 4)
         _text(canvas, text, (left, row), size)
+    return x0, y0, x1, y1
+
+
+def _points_in(lines: list[Pixels], box: Box) -> int:
+    points = np.concatenate([np.zeros((0, 2)), *lines])
+    return int(((points >= box[:2]) & (points < box[2:])).all(axis=1).sum())
 
 
 def _width(text: str, size: float) -> int:

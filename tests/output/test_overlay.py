@@ -10,6 +10,7 @@ import pytest
 from gcar_deploy.config import QualityOptions
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.output import overlay as overlays
 from gcar_deploy.output.colors import branch_color
 from gcar_deploy.output.overlay import backdrop, grey8, overlay, png_bytes
 from gcar_deploy.output.words import LEFT_OUT, explained
@@ -132,6 +133,63 @@ def test_a_probable_ghost_is_dashed_and_told_in_the_legend():
     assert coloured(dashed, 47, 69).all()  # the other half is whole
     bottom = plain.shape[0] // 2
     assert (plain[bottom:] != dashed[bottom:]).any()
+
+
+def drawn_texts(monkeypatch):
+    """What is written from now on: text -> left, top, right, bottom."""
+    told, keep = {}, overlays._text
+
+    def write(canvas, text, at, size, *color):
+        told[text] = (at[0], at[1] - round(22 * size), at[0] + overlays._width(text, size), at[1])
+        keep(canvas, text, at, size, *color)
+
+    monkeypatch.setattr(overlays, "_text", write)
+    return told
+
+
+def tree_of(carm, *lines):
+    """Straight branches between pixels."""
+    branches = []
+    for line in lines:
+        ends = carm.backproject(np.array(line, float), np.full(2, carm.sod_mm))
+        points = ends[0] + np.linspace(0, 1, 60)[:, None] * (ends[1] - ends[0])
+        flat = np.full(60, 1.5)
+        branches.append(Branch(points_mm=points, radius_mm=flat, sigma_mm=flat * np.nan,
+                               confidence=flat / 1.5, start=0, end=1))  # fmt: skip
+    return Tree(nodes_mm=ends, branches=tuple(branches))
+
+
+def test_numbers_stand_elsewhere_on_their_branch_where_its_middle_is_taken(monkeypatch):
+    """Two that cross in their middles; one that begins beside the words at the top."""
+    view, told = blank_view(512, 512), drawn_texts(monkeypatch)
+    lines = [[(200, 200), (400, 400)], [(200, 400), (400, 200)], [(20, 24), (500, 24)]]
+    picture_of(view, tree_of(view.carm, *lines))
+    assert {"1", "2", "3"} <= told.keys()
+    places = list(told.values())
+    for k, a in enumerate(places):
+        for b in places[:k]:
+            assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3], told
+    for number, ((x0, y0), (x1, y1)) in enumerate(lines, start=1):
+        zoom = 2
+        x, _, _, y = told[str(number)]
+        at = np.array([(x - 8) / zoom, (y + 6) / zoom])
+        way = np.array([x1 - x0, y1 - y0]) / np.hypot(x1 - x0, y1 - y0)
+        away = at - (x0, y0) - way * (way @ (at - (x0, y0)))
+        assert np.linalg.norm(away) < 2
+
+
+@pytest.mark.parametrize("low", [False, True])
+def test_the_legend_stands_on_a_dark_plate_where_fewer_branches_lie(monkeypatch, low):
+    view, told = blank_view(512, 512), drawn_texts(monkeypatch)
+    row = 500 if low else 40
+    tree = tree_of(view.carm, [(300, row), (500, row)])
+    bright = np.tile(np.linspace(0, 1, 512, dtype=np.float32), (512, 1))
+    picture = overlay(backdrop(bright, view.mask), view, tree, JUDGED)
+    left, top, _, bottom = told["vessel not explained"]
+    assert (bottom < picture.shape[0] / 2) == low
+    # Between its lines' marks and words there is the plate alone.
+    plate, beside = picture[top:bottom, left - 8 : left - 4], picture[700, left - 8 : left - 4]
+    assert plate.mean() < 0.4 * beside.mean()
 
 
 def test_a_catheter_has_a_colour_and_a_line_in_the_legend():
