@@ -131,6 +131,11 @@ def test_much_to_say_leaves_the_pictures_in_sight_and_one_page_in_print(serve, b
     rows = page.locator("#lesions tbody tr")
     listed = [row.inner_text().split() for row in rows.all() if row.is_visible()]
     assert 3 < len(listed) < rows.count() and all(float(one[1]) >= 20 for one in listed)
+    cells = [row.locator("td").nth(1) for row in rows.all()]
+    hidden = [cell.text_content() for cell in cells if not cell.is_visible()]
+    short = hidden.count("\u2013")
+    more = f"and {len(hidden) - short} narrowed by less than 20 %, {short} too short to say"
+    assert short and page.inner_text("#more") == more
     page.click("#more")
     assert all(row.is_visible() for row in rows.all())
     page.click("#more")
@@ -138,6 +143,7 @@ def test_much_to_say_leaves_the_pictures_in_sight_and_one_page_in_print(serve, b
     assert document.count(b"/Type /Page\n") + document.count(b"/Type /Page ") == 1
     assert page.locator(".status details[open]").count() == 0
     page.emulate_media(media="print")
+    assert page.inner_text("#more") == more
     head = page.inner_text("header")
     assert "IM1.dcm" in head and "IM8.dcm" in head and "printed 20" in head
     shown = boxes(page, ".view", "#curve", "#lesions", "#status", "#corrections")

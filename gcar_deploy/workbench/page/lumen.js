@@ -22,6 +22,14 @@ const besides = row => {
   return told.length ? el("small", { class: "besides", title: "further lesions, mm from the branch's inlet; narrowing without recovery is none" }, ` ${told.join(", ")}`) : "";
 };
 
+/** Class of a row: what is narrowed little, and where nothing can be said of it, is listed on demand. */
+const kind = (row, rank) => {
+  const percent = row.stenosis_percent;
+  if (percent >= 50) return "severe";
+  if (rank < FEW || row.lesion_length_mm) return "";
+  return percent === null ? "unsaid" : percent < SLIGHT ? "slight" : "";
+};
+
 /** Fill the table, the most severe narrowing first; erase is called with a branch to delete. */
 export function table(store, erase) {
   const branches = [...store.result.scene.branches].sort((a, b) => (b.stenosis ?? -1) - (a.stenosis ?? -1) || a.branch - b.branch);
@@ -36,7 +44,7 @@ export function table(store, erase) {
       row.name ? el("small", { title: "probability of the name by anatomy" }, ` ${Math.floor(100 * row.name_confidence)} %`) : "");
     jump.querySelector(".swatch").style.background = branch.color;
     const drop = el("button", { type: "button", class: "small", "aria-label": `Delete branch ${branch.branch}`, title: "Delete this branch (Delete)", onclick: e => { e.stopPropagation(); erase(branch); } }, "Delete");
-    return el("tr", { "data-branch": branch.branch, class: percent >= 50 ? "severe" : rank >= FEW && percent < SLIGHT && !row.lesion_length_mm ? "slight" : "", onclick: () => jumpTo(store, branch) },
+    return el("tr", { "data-branch": branch.branch, class: kind(row, rank), onclick: () => jumpTo(store, branch) },
       el("td", {}, jump), ...cells.map(content => el("td", {}, content)), el("td", {}, drop));
   });
   $("lesions").replaceChildren(
@@ -48,9 +56,12 @@ export function table(store, erase) {
 
 /** Say what is not listed, and offer it. */
 export function more() {
-  const count = $("lesions").querySelectorAll(".slight").length, all = $("lesions").classList.contains("all");
-  $("more").hidden = !count;
-  $("more").textContent = all ? "Narrowings alone" : `and ${count} more, narrowed by less than ${SLIGHT} %`;
+  const [slight, unsaid] = [".slight", ".unsaid"].map(one => $("lesions").querySelectorAll(one).length);
+  const all = $("lesions").classList.contains("all");
+  $("more").hidden = !slight && !unsaid;
+  $("more").classList.toggle("back", all);
+  const told = [slight ? `${slight} narrowed by less than ${SLIGHT} %` : "", unsaid ? `${unsaid} too short to say` : ""];
+  $("more").textContent = all ? "Narrowings alone" : `and ${told.filter(text => text).join(", ")}`;
 }
 
 /** Choose a branch and mark its narrowing in every drawing. */
