@@ -43,22 +43,28 @@ export function inside(event, target) {
   return [event.clientX - box.left, event.clientY - box.top];
 }
 
+const FONT = size => `600 ${size}px system-ui, sans-serif`;
 /** Text that is readable on any picture. */
 export function label(ctx, text, x, y, color = "#fff", size = 13) {
-  ctx.font = `600 ${size}px system-ui, sans-serif`;
+  ctx.font = FONT(size);
   ctx.lineWidth = 3.5; ctx.strokeStyle = "#000"; ctx.strokeText(text, x, y);
   ctx.fillStyle = color; ctx.fillText(text, x, y);
 }
 
-/** Write names beside lines: at a place of each where no other stands, the first lines first. */
+/** Write names beside lines: whole, at a place of each where no other stands, the first lines first. */
 export function names(ctx, lines) {
-  const taken = [];
+  const taken = [], { clientWidth: width, clientHeight: height } = ctx.canvas, high = 14;
+  ctx.font = FONT(13);
   for (const [text, at, color] of lines) {
+    const wide = ctx.measureText(text).width;
+    // What begins at the border has its name within it; what is outside has none.
     const free = [0.5, 0.3, 0.7, 0.85, 0.15].map(share => at[Math.floor(share * (at.length - 1))])
-      .find(([x, y]) => taken.every(([px, py]) => Math.abs(px - x) > 44 || Math.abs(py - y) > 16));
+      .filter(([x, y]) => x >= 0 && y >= 0 && x <= width && y <= height)
+      .map(([x, y]) => [Math.min(x + 7, width - wide - 3), Math.max(y - 5, high)])
+      .find(([x, y]) => taken.every(([px, py, far]) => x > far + 5 || px > x + wide + 5 || Math.abs(py - y) > high));
     if (!free) continue;
-    taken.push(free);
-    label(ctx, text, free[0] + 7, free[1] - 5, color);
+    taken.push([...free, free[0] + wide]);
+    label(ctx, text, ...free, color);
   }
 }
 

@@ -39,7 +39,7 @@ export function table(store, erase) {
       fixed(row.minimal_diameter_mm, 2), reference(row), fixed(row.lesion_length_mm || null, 1),
       row.minimal_at_mm === null || branch.from_ostium === null ? "\u2013" : (branch.from_ostium + row.minimal_at_mm).toFixed(0), fixed(row.length_mm, 0),
       row.ghost_probability === null ? "\u2013" : `${Math.round(100 * row.ghost_probability)}`];
-    const jump = el("button", { type: "button", class: "plain" }, el("span", { class: "swatch" }), nameOf(branch),
+    const jump = el("button", { type: "button", class: "plain" }, el("span", {}, el("span", { class: "swatch" }), nameOf(branch)),
       // Rounded down: what is not certain never reads 100 %.
       row.name ? el("small", { title: "probability of the name by anatomy" }, ` ${Math.floor(100 * row.name_confidence)} %`) : "");
     jump.querySelector(".swatch").style.background = branch.color;
@@ -139,10 +139,9 @@ export class Curve {
       branch.arc.forEach((s, i) => ctx[i ? "lineTo" : "moveTo"](x(start + s), y(2 * branch.radius[i])));
       ctx.stroke();
       if (start > 0) { ctx.strokeStyle = tone("line"); ctx.lineWidth = 1; ctx.beginPath(); ctx.moveTo(x(start), top); ctx.lineTo(x(start), bottom); ctx.stroke(); }
-      ctx.fillStyle = tone("ink"); ctx.font = "600 12px system-ui, sans-serif"; ctx.textAlign = "center";
-      ctx.fillText(nameOf(branch), x(start + branch.arc.at(-1) / 2), 12);
       if (branch.least) ring(ctx, x(start + branch.least[0]), y(branch.least[1]), 4, "#d55e00", "#fff");
     }
+    this.names(ctx, parts.map(part => [part.branch, x(part.start + part.branch.arc.at(-1) / 2)]), width);
     const { cursor } = this.store, part = cursor && parts.find(p => p.branch.branch === cursor.branch);
     if (part) {
       const s = part.start + part.branch.arc[cursor.at];
@@ -150,6 +149,20 @@ export class Curve {
       ring(ctx, x(s), y(2 * part.branch.radius[cursor.at]), 5, "#ffe14d", "#1a2230");
     }
     $("point").textContent = part ? this.said(part, cursor.at) : "Move along the curve to find a point in every drawing. Dashed: reference; circle: gravest narrowing; shaded: lesion.";
+  }
+  /** Write names above their parts: the number alone where there is no more room, the longest first. */
+  names(ctx, middles, width) {
+    ctx.fillStyle = tone("ink"); ctx.font = "600 12px system-ui, sans-serif"; ctx.textAlign = "left";
+    const taken = [], rank = branch => branch.branch === this.store.chosen ? Infinity : branch.arc.at(-1);
+    for (const [branch, middle] of [...middles].sort(([a], [b]) => rank(b) - rank(a))) {
+      for (const text of [nameOf(branch), String(branch.branch)]) {
+        const wide = ctx.measureText(text).width, left = Math.max(2, Math.min(width - 2 - wide, middle - wide / 2));
+        if (taken.some(([a, b]) => left < b + 6 && a < left + wide + 6)) continue;
+        taken.push([left, left + wide]);
+        ctx.fillText(text, left, 12);
+        break;
+      }
+    }
   }
   axes(ctx, { from, left, right, top, bottom, most, length, x, y }) {
     ctx.font = "12px system-ui, sans-serif"; ctx.fillStyle = tone("soft"); ctx.strokeStyle = tone("line"); ctx.lineWidth = 1;
@@ -160,8 +173,9 @@ export class Curve {
     ctx.textAlign = "center"; ctx.textBaseline = "top";
     const stride = [5, 10, 20, 50, 100].find(t => length / t <= 8) || 200;
     for (let s = 0; s <= length; s += stride) ctx.fillText(String(s), x(s), bottom + 4);
-    ctx.textAlign = "right"; ctx.fillText(`mm ${from}`, right, bottom + 18);
-    ctx.textAlign = "left"; ctx.fillText("diameter, mm", 4, bottom + 18); ctx.textBaseline = "alphabetic";
+    const up = "diameter, mm", free = right - 12 - ctx.measureText(up).width, whole = `mm ${from}`;
+    ctx.textAlign = "right"; ctx.fillText(ctx.measureText(whole).width < free ? whole : whole.split(",")[0], right, bottom + 18);
+    ctx.textAlign = "left"; ctx.fillText(up, 4, bottom + 18); ctx.textBaseline = "alphabetic";
   }
   said({ branch, start }, i) {
     const reference = branch.reference[i], sigma = branch.sigma[i];

@@ -12,9 +12,9 @@ export class Picture {
     this.canvas = el("canvas", { tabindex: 0, role: "img", "aria-label": `View ${info.id}, ${info.name}: the picture with the tree; arrow keys move, plus and minus zoom` });
     this.title = el("div", { class: "title" });
     const button = (text, name, act) => el("button", { type: "button", "aria-label": `${name} view ${info.id}`, title: name, onclick: act }, text);
-    this.root = el("div", { class: "view" }, this.canvas, this.title, el("div", { class: "zoom" },
+    this.root = el("div", { class: "view" }, this.canvas, el("div", { class: "foot" }, this.title, el("div", { class: "zoom" },
       button("+", "Zoom in", () => this.scale(1.4)), button("\u2212", "Zoom out", () => this.scale(1 / 1.4)),
-      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => saved(this.canvas, `view${number}.png`))));
+      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => saved(this.canvas, `view${number}.png`)))));
     this.listen();
   }
 

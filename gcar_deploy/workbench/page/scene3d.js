@@ -19,9 +19,9 @@ export class Scene3D {
     this.title = el("div", { class: "title", "aria-live": "polite" });
     this.buttons = el("div", { class: "below" });
     const button = (text, name, act) => el("button", { type: "button", "aria-label": `${name} the tree`, title: name, onclick: act }, text);
-    this.root = el("div", { class: "view" }, this.canvas, this.title, el("div", { class: "zoom" },
+    this.root = el("div", { class: "view" }, this.canvas, el("div", { class: "foot" }, this.title, el("div", { class: "zoom" },
       button("+", "Zoom in on", () => this.scale(1.3)), button("\u2212", "Zoom out of", () => this.scale(1 / 1.3)),
-      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => saved(this.canvas, "tree.png"))), this.buttons);
+      button("\u2302", "Reset", () => this.reset()), button("\u2913", "Save picture of", () => saved(this.canvas, "tree.png")))), this.buttons);
     this.angles = [0, 0]; this.zoom = 1; this.shift = [0, 0]; this.kind = "branch";
     this.listen();
   }
