@@ -13,6 +13,8 @@ import struct
 import zlib
 from collections.abc import Iterator
 
+from gcar_deploy.imaging.tiff_data import check_data, one
+
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_SIGNATURES = (b"II*\x00", b"MM\x00*")
 MAX_CHUNK_BYTES = 16 * 2**20
@@ -116,7 +118,7 @@ def _check_upright(exif: bytes) -> None:
         tags, _ = _tiff_directory(exif, order, _first_page(exif, order))
     except ValueError:
         return
-    if _one(tags, 274, 1) != 1:
+    if one(tags, 274, 1) != 1:
         raise ValueError(_TURNED)
 
 
@@ -206,9 +208,9 @@ def _check_tiff_page(
     data: bytes, tags: dict[int, tuple[int, ...]], smallest: int, largest: int, binary: bool = False
 ) -> tuple[int, tuple[int, int]]:
     """Return bit depth and (rows, columns) of one page."""
-    rows, columns = _one(tags, 257, 0), _one(tags, 256, 0)
+    rows, columns = one(tags, 257, 0), one(tags, 256, 0)
     check_sides(rows, columns, smallest, largest)
-    if _one(tags, 259, 1) in _JPEG:
+    if one(tags, 259, 1) in _JPEG:
         raise ValueError(
             "holds a JPEG picture: its compression loses thin vessels; export it without, or as PNG"
         )
@@ -217,34 +219,14 @@ def _check_tiff_page(
         raise ValueError(f"has {sorted(depths)} bits per sample; {_TIFF_KINDS}")
     if formats != {_FLOATING if 32 in depths else _UNSIGNED}:
         raise ValueError(f"holds signed samples or floating-point numbers of 16 bit; {_TIFF_KINDS}")
-    if _one(tags, 262, -1) not in (1, 2):
+    if one(tags, 262, -1) not in (1, 2):
         raise ValueError("is not plain grey (black is zero); export it as 8 or 16 bit grey")
-    if _one(tags, 274, 1) != 1:
+    if one(tags, 274, 1) != 1:
         raise ValueError(_TURNED)
-    if not 1 <= _one(tags, 277, 1) <= (1 if 32 in depths else 4):
+    if not 1 <= one(tags, 277, 1) <= (1 if 32 in depths else 4):
         raise ValueError("has an invalid number of channels; export it as 8 or 16 bit grey")
-    _check_tiff_data(data, tags, rows, columns)
+    check_data(data, tags, rows, columns)
     return max(*depths, 8), (rows, columns)
-
-
-def _check_tiff_data(
-    data: bytes, tags: dict[int, tuple[int, ...]], rows: int, columns: int
-) -> None:
-    starts = tags.get(273) or tags.get(324) or ()
-    counts = tags.get(279) or tags.get(325) or ()
-    if not starts or len(starts) != len(counts):
-        raise ValueError("has no picture data; export it again")
-    for start, count in zip(starts, counts, strict=True):
-        if start + count > len(data):
-            raise ValueError("is truncated; copy or export it again")
-    bits_per_pixel = tags.get(258, (1,))[0] * _one(tags, 277, 1)
-    if _one(tags, 259, 1) == 1 and sum(counts) < rows * -(-columns * bits_per_pixel // 8):
-        raise ValueError("is truncated; copy or export it again")
-
-
-def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int) -> int:
-    values = tags.get(tag, ())
-    return values[0] if values else default
 
 
 def _tiff_directory(data: bytes, order: str, at: int) -> tuple[dict[int, tuple[int, ...]], int]:
@@ -253,10 +235,11 @@ def _tiff_directory(data: bytes, order: str, at: int) -> tuple[dict[int, tuple[i
         (entries,) = struct.unpack_from(order + "H", data, at)
         if entries > _MAX_TIFF_ENTRIES:
             raise ValueError("is damaged (too many TIFF tags); export it again")
-        tags = {}
+        tags: dict[int, tuple[int, ...]] = {}
         for i in range(entries):
             tag, kind, count = struct.unpack_from(order + "HHI", data, at + 2 + 12 * i)
-            tags[tag] = _tiff_values(data, order, at + 10 + 12 * i, kind, count)
+            # Of a tag that stands twice, the first counts, as for the decoder.
+            tags.setdefault(tag, _tiff_values(data, order, at + 10 + 12 * i, kind, count))
         (next_page,) = struct.unpack_from(order + "I", data, at + 2 + 12 * entries)
     except struct.error:
         raise ValueError("is truncated or damaged; copy or export it again") from None

@@ -120,7 +120,7 @@ def read_stack(
         if rows * columns * count > limits.max_pixels:
             raise ValueError(f"holds {count} pages of {columns} x {rows} pixels, which is too much")
         try:
-            with quiet_decoder(unless=depth == 8):
+            with quiet_decoder():
                 done, pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             done, pages = False, ()
@@ -138,11 +138,8 @@ def read_stack(
 
 
 @contextlib.contextmanager
-def quiet_decoder(*, unless: bool = False) -> Iterator[None]:
+def quiet_decoder() -> Iterator[None]:
     """Keep OpenCV from writing to stderr what a damaged file is told of by an error."""
-    if unless:
-        yield
-        return
     with _ONE_DECODER:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
@@ -169,8 +166,7 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits, binary: bool) -> tu
     depth = check(data, limits.min_side, limits.max_side, binary=binary)
     try:
         # UNCHANGED: GRAYSCALE would make 8 bit of 16 and obey an EXIF rotation.
-        # Of 8 bit, OpenCV takes a TIFF that it cannot decode, and its own line is all that tells.
-        with quiet_decoder(unless=found == "TIFF" and depth == 8):
+        with quiet_decoder():
             picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         picture = None
