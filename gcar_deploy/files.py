@@ -8,6 +8,7 @@ import hashlib
 import os
 import re
 import stat
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -48,6 +49,34 @@ def read_bounded(path: str | Path, max_bytes: int) -> bytes:
     return data
 
 
+def is_folder(path: str | Path) -> bool:
+    """Whether there is a folder; False for what cannot be looked at: who opens it says why."""
+    # Path.is_dir raises where a folder on the way may not be entered, or a name is too long.
+    return os.path.isdir(path)
+
+
+def is_file(path: str | Path) -> bool:
+    """Whether there is a file; as ``is_folder``."""
+    return os.path.isfile(path)
+
+
+def is_there(path: str | Path) -> bool:
+    """Whether there is a file or folder; as ``is_folder``."""
+    return os.path.exists(path)
+
+
+def check_opens(path: str | Path) -> None:
+    """Refuse what is no file that can be opened and read.
+
+    Raises
+    ------
+    ValueError
+        As ``read_bounded``.
+    """
+    with _opened(path, sys.maxsize) as (stream, _):
+        stream.read(1)
+
+
 def digest_of(path: Path, max_bytes: int, max_frames: int) -> bytes:
     """SHA-256 of a file, or of the frames of a folder by name and content.
 
@@ -58,7 +87,7 @@ def digest_of(path: Path, max_bytes: int, max_frames: int) -> bytes:
     """
     digest = hashlib.sha256()
     try:
-        if os.path.isdir(path):
+        if is_folder(path):
             for frame in frames_in(path)[:max_frames]:
                 digest.update(os.fsencode(frame.name) + b"\0" + digest_of(frame, max_bytes, 0))
             return digest.digest()
@@ -130,7 +159,10 @@ def _opened(path: str | Path, max_bytes: int) -> Iterator[tuple[IO[bytes], int]]
             raise ValueError(
                 f"is larger than the {_size(max_bytes)} that are read ({_size(info.st_size)})"
             )
-        yield stream, info.st_size
+        try:
+            yield stream, info.st_size
+        except OSError as error:
+            raise ValueError(f"cannot be read ({error.strerror}); check the path") from None
 
 
 def read_text(path: str | Path, max_bytes: int) -> str:

@@ -17,6 +17,7 @@ from gcar_deploy.batch.summary import write_summary
 from gcar_deploy.batch.work import BatchJob
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
+from gcar_deploy.files import is_there
 
 SCHEMA = "gcar-batch/1"
 #: statuses of cases that have a result folder
@@ -112,7 +113,7 @@ def _known(
 def _own(out: Path) -> Path:
     """Make the folder, or recognise it as a batch's."""
     mark = out / "batch.json"
-    if out.exists() and not mark.is_file() and (not out.is_dir() or any(out.iterdir())):
+    if is_there(out) and not mark.is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists and holds no batch; choose another folder")
     rows = out / "rows"
     try:

@@ -39,11 +39,12 @@ def from_dicom(order: Order, out_file: Path | None) -> None:
     from gcar_deploy.config import RunOptions
     from gcar_deploy.dicom.scene import read_views
     from gcar_deploy.errors import UsageError
+    from gcar_deploy.files import is_there
     from gcar_deploy.geometry.scene import scene_to_json
 
     if len(order.views) < 2:
         raise UsageError(f"{len(order.views)} run given; a geometry needs two or more")
-    if out_file is not None and out_file.exists():
+    if out_file is not None and is_there(out_file):
         raise UsageError(f"{out_file} exists; name a new file")
     _, scene, notes = read_views(list(order.views), order.options(RunOptions()).dicom)
     for note in notes:

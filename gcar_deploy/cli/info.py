@@ -49,12 +49,14 @@ def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:
     """Names of the listed files that are missing or have another SHA-256."""
     import hashlib
 
-    if not folder.is_dir():
+    from gcar_deploy.files import is_file, is_folder
+
+    if not is_folder(folder):
         return []
     out = []
     for name, entry in summary.get("files", {}).items():
         file = folder / Path(name).name
-        if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != entry["sha256"]:
+        if not is_file(file) or hashlib.sha256(file.read_bytes()).hexdigest() != entry["sha256"]:
             out.append(name)
     return out
 

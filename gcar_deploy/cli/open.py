@@ -104,24 +104,28 @@ def _of_folder(order: Order, folder: Path) -> Order:
 def _first(desk: Any, order: Order) -> tuple[str | None, str | None]:
     """Put on the desk what the command names; return the case's name, or the key of a result."""
     from gcar_deploy.errors import ImageError
+    from gcar_deploy.files import is_folder, is_there
+    from gcar_deploy.imaging.read import check_opens
     from gcar_deploy.workbench.case import ORDER_NAME
     from gcar_deploy.workbench.desk import absolute, case_folder
 
     views = order.views
     if not views:
         return None, None
-    if len(views) == 1 and views[0].is_dir():
+    if len(views) == 1 and is_folder(views[0]):
         folder = views[0]
         if (case_folder(folder) / ORDER_NAME).is_file():
             return str(desk.again(folder).id), None
         if (folder / "report.html").is_file():
             return None, str(desk.shelve(folder))
         order = _of_folder(order, folder)
-    elif len(views) == 1 and not views[0].exists():
+    elif len(views) == 1 and not is_there(views[0]):
         raise ImageError(f"{views[0]}: no such file or folder; check the path")
     check_view_numbers(order)
     for path in order.files.values():
         # The page would open, and show that nothing is there.
-        if not path.exists():
+        if not is_there(path):
             raise ImageError(f"{path}: no such file; check the path")
+        if not is_folder(path):
+            check_opens(path)
     return str(desk.add(desk.new_folder("case"), absolute(order)).id), None

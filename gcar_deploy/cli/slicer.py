@@ -27,6 +27,7 @@ def slicer(result: Path, out: Path | None, force: bool) -> None:
       Slicer result.mrml
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
+    from gcar_deploy.files import is_there
     from gcar_deploy.output.slicer_scene import slicer_scene
     from gcar_deploy.output.stored import read_summary
 
@@ -35,7 +36,7 @@ def slicer(result: Path, out: Path | None, force: bool) -> None:
     out = folder.with_name(f"{folder.name}.mrml") if out is None else out.resolve()
     if out.suffix != ".mrml":
         raise UsageError(f"--out {out.name} must end in .mrml, or Slicer does not know it")
-    if out.exists() and not force:
+    if is_there(out) and not force:
         raise UsageError(f"{out} exists; add --force to replace it")
     try:
         out.write_text(slicer_scene(folder, out), encoding="utf-8")

@@ -18,7 +18,7 @@ from typing import Any
 
 from gcar_deploy.config import DicomLimits
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
-from gcar_deploy.files import read_bounded
+from gcar_deploy.files import is_file, read_bounded
 
 CLASSIC = "1.2.840.10008.5.1.4.1.1.12.1"
 ENHANCED = "1.2.840.10008.5.1.4.1.1.12.1.1"
@@ -158,7 +158,7 @@ def is_dicom(path: str | Path) -> bool:
     path = Path(path)
     if path.suffix.lower() in (".dcm", ".dicom", ".ima"):
         return True
-    if path.suffix.lower() in (".png", ".tif", ".tiff", ".npy") or not path.is_file():
+    if path.suffix.lower() in (".png", ".tif", ".tiff", ".npy") or not is_file(path):
         return False
     try:
         with path.open("rb") as stream:

@@ -16,7 +16,7 @@ from gcar_deploy.dicom.frames import Frames
 from gcar_deploy.dicom.header import Header, is_dicom, read_header
 from gcar_deploy.dicom.shutter import open_field
 from gcar_deploy.errors import ImageError
-from gcar_deploy.files import frames_in
+from gcar_deploy.files import frames_in, is_folder
 from gcar_deploy.imaging.read import is_stack, read_picture, read_stack
 from gcar_deploy.types import Image, Mask
 
@@ -66,7 +66,7 @@ class Cine:
 
 def is_cine(path: str | Path) -> bool:
     """Whether a path is a folder or a TIFF of several pages: a run that is no DICOM file."""
-    return Path(path).is_dir() or is_stack(path)
+    return is_folder(path) or is_stack(path)
 
 
 def open_cine(
@@ -89,7 +89,7 @@ def open_cine(
     ImageError, UsageError
     """
     path = Path(path)
-    if path.is_dir():
+    if is_folder(path):
         cine: Cine | None = _of_folder(path, options, subtracted)
     elif is_dicom(path):
         cine = _of_dicom(path, options)

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gcar_deploy import files
 from gcar_deploy.config import DicomLimits, PictureLimits
 from gcar_deploy.errors import ImageError
 from gcar_deploy.files import read_bounded
@@ -78,6 +79,19 @@ def read_picture(
     sha256 = hashlib.sha256(data).hexdigest()
     _log.debug("read %d bytes, %s, %d bit, sha256 %s", len(data), pixels.shape, depth, sha256)
     return pixels, depth, sha256
+
+
+def check_opens(path: str | Path) -> None:
+    """Refuse what is no file, or cannot be opened, before more is said of what it is not.
+
+    Raises
+    ------
+    ImageError
+    """
+    try:
+        files.check_opens(path)
+    except ValueError as error:
+        raise ImageError(f"{Path(path).name}: {error}") from None
 
 
 def is_stack(path: str | Path) -> bool:

@@ -23,7 +23,7 @@ from gcar_deploy.config import (
 )
 from gcar_deploy.config.ranges import Range, check_field, check_number
 from gcar_deploy.errors import GeometryError, UsageError
-from gcar_deploy.files import digest_of, read_text
+from gcar_deploy.files import digest_of, is_file, read_text
 from gcar_deploy.geometry.fields import (
     LEAST_VIEWS,
     MOST_VIEWS,
@@ -165,7 +165,7 @@ class Order:
         new = {
             k: digest_of(path, _MOST_BYTES, 0).hex()
             for k, path in enumerate(self.views, start=1)
-            if k not in self.drawn_on and path.is_file()
+            if k not in self.drawn_on and is_file(path)
         }
         return dataclasses.replace(self, drawn_on={**self.drawn_on, **new})
 

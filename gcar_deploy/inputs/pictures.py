@@ -15,14 +15,14 @@ from gcar_deploy.config import DicomOptions, ImagingOptions, PictureLimits, RunO
 from gcar_deploy.dicom.header import is_dicom
 from gcar_deploy.dicom.scene import as_angiogram, check_origin, read_run, read_views
 from gcar_deploy.errors import GeometryError, ImageError, UsageError
-from gcar_deploy.files import path_of
+from gcar_deploy.files import is_folder, path_of
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Scene, View, load_scene, match_picture, parse_scene
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.extract import above_half
 from gcar_deploy.imaging.full_mask import MOST_VESSEL
-from gcar_deploy.imaging.read import from_zero, read_picture
+from gcar_deploy.imaging.read import check_opens, from_zero, read_picture
 from gcar_deploy.inputs.drawn import Drawn
 from gcar_deploy.inputs.runs import find_runs, seen_runs, together, with_bare
 
@@ -288,12 +288,13 @@ def _from_headers(
     """Pictures whose own headers tell the geometry: DICOM XA alone."""
     paths = [view for view in views if isinstance(view, (str, Path))]
     for path in paths:
-        if Path(path).is_dir():
+        if is_folder(path):
             raise UsageError(
                 f"{Path(path).name} is a folder: name the DICOM file of the run in it, or tell the "
                 "geometry of its pictures (--geom geom.json)"
             )
         if not is_dicom(path):
+            check_opens(path)
             raise UsageError(
                 f"{Path(path).name} is no DICOM file: its geometry is needed (--geom geom.json)"
             )

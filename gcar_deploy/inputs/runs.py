@@ -28,6 +28,7 @@ from gcar_deploy.geometry.scene import Intensity, Scene, match_picture
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.chosen_frame import ChosenFrame, FramePair
 from gcar_deploy.imaging.extract import asks_network
+from gcar_deploy.imaging.read import check_opens
 from gcar_deploy.types import Image
 
 #: told the share done, 0 .. 1
@@ -171,6 +172,7 @@ def compared(
     runs = find_runs(views, options, geometry)
     for k, view in enumerate(views, start=1):
         if k not in runs.cines:
+            check_opens(view)
             raise UsageError(f"{Path(view).name} is no run of several frames")
     first, second = (_needed(k, runs, geometry, options) for k in (1, 2))
     a = masses_of(first, None if report is None else lambda share: report(0.5 * share))

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gcar_deploy.errors import UsageError
-from gcar_deploy.files import read_bounded
+from gcar_deploy.files import is_folder, read_bounded
 from gcar_deploy.measure import Sections
 from gcar_deploy.output.tables import SECTION_COLUMNS
 from gcar_deploy.tree.tree import Branch, Tree
@@ -87,7 +87,7 @@ def read_summary(path: Path) -> dict[str, Any]:
     UsageError
         There is none, or it is not of schema gcar-result/1.
     """
-    file = path / "result.json" if path.is_dir() else path
+    file = path / "result.json" if is_folder(path) else path
     try:
         summary = json.loads(read_bounded(file, _MOST_BYTES).decode("utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):

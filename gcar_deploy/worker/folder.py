@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.files import is_folder
 
 #: a picture or geometry file larger than this is not copied
 MAX_BYTES = 256 * 2**20
@@ -30,7 +31,7 @@ class AllowedFolder:
     """
 
     def __init__(self, root: Path) -> None:
-        if not root.is_dir():
+        if not is_folder(root):
             raise UsageError(f"{root} is not a folder")
         self.root = root.resolve()
 
