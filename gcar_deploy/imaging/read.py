@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import logging
 import threading
-import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,16 +16,13 @@ from gcar_deploy import files
 from gcar_deploy.config import DicomLimits, PictureLimits
 from gcar_deploy.errors import ImageError
 from gcar_deploy.files import read_bounded
-from gcar_deploy.imaging import png_guard
+from gcar_deploy.imaging import npy_header, png_guard
 from gcar_deploy.types import Array, Image
 
 _log = logging.getLogger(__name__)
 #: the level of OpenCV's messages is one for all threads
 _ONE_DECODER = threading.Lock()
-_NPY_SIGNATURE = b"\x93NUMPY"
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
-#: what else a hostile header can raise
-_HEADER = (MemoryError, RecursionError, OverflowError)
 _NPY_DEPTH = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 _TYPE_OF = {8: np.uint8, 16: np.uint16, 32: np.float32}
 #: a multi-page file that is larger is no run
@@ -196,7 +191,7 @@ def _sniff(data: bytes) -> str | None:
         return "PNG"
     if data[:4] in png_guard.TIFF_SIGNATURES:
         return "TIFF"
-    return "NPY" if data.startswith(_NPY_SIGNATURE) else None
+    return "NPY" if data.startswith(npy_header.SIGNATURE) else None
 
 
 def _one_channel(picture: Array) -> Array:
@@ -213,29 +208,20 @@ def _one_channel(picture: Array) -> Array:
 
 
 def _decode_npy(data: bytes, limits: PictureLimits, binary: bool) -> tuple[Array, int]:
-    stream = io.BytesIO(data)
     try:
-        version = np.lib.format.read_magic(stream)
-        readers = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }
-        if version not in readers:
-            raise ValueError
-        shape, fortran, dtype = readers[version](stream)
-    except (ValueError, TypeError, SyntaxError, EOFError, tokenize.TokenError, *_HEADER):
+        dtype, fortran, shape, start = npy_header.read_header(data)
+    except ValueError:
         raise ValueError("has a damaged NPY header; save it again with numpy.save") from None
     depths = {**_NPY_DEPTH, "bool": 8} if binary else _NPY_DEPTH
-    if dtype.hasobject or dtype.newbyteorder("=").name not in depths or dtype.names:
+    if dtype is None or dtype.name not in depths:
         raise ValueError("holds other values than uint8, uint16, float32 or float64; convert it")
     if len(shape) != 2:
         raise ValueError(f"has {len(shape)} dimensions; save one grey picture (rows, columns)")
     png_guard.check_sides(*shape, limits.min_side, limits.max_side)
-    if len(data) - stream.tell() != shape[0] * shape[1] * dtype.itemsize:
+    if len(data) - start != shape[0] * shape[1] * dtype.itemsize:
         raise ValueError("is truncated or has bytes to spare; save it again with numpy.save")
-    array = np.frombuffer(data, dtype, offset=stream.tell())
-    array = array.reshape(shape, order="F" if fortran else "C")
-    return array, depths[dtype.newbyteorder("=").name]
+    array = np.frombuffer(data, dtype, offset=start)
+    return array.reshape(shape, order="F" if fortran else "C"), depths[dtype.name]
 
 
 def from_zero(array: Array) -> Array:

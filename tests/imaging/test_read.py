@@ -130,6 +130,13 @@ def _npy(array, **kwargs):
     return stream.getvalue()
 
 
+def _headed(header, array):
+    """NPY file with a header as other programs, or damage, make it."""
+    text = header.encode("latin-1").ljust(118) + b"\n"
+    values = array.tobytes()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + values
+
+
 def _tiff(**changes):
     """A 16x16 8-bit TIFF by hand; changes: tag number with t in front -> value."""
     tags = {256: 16, 257: 16, 258: 8, 259: 1, 262: 1, 273: 200, 277: 1, 278: 16, 279: 256}
@@ -199,6 +206,21 @@ _BAD = {
     "cut.npy": (_npy(np.zeros((16, 16)))[:-1], "truncated"),
     "spare.npy": (_npy(np.zeros((16, 16))) + b"\0", "to spare"),
     "small.npy": (_npy(np.zeros((2, 2))), "each side must be"),
+    "fields.npy": (_npy(np.zeros((16, 16), [("a", "u1"), ("b", "u1")])), "other values"),
+    "tuple.npy": (
+        _headed("{'descr': (), 'fortran_order': False, 'shape': (16, 16)}", _GREY),
+        "NPY",
+    ),
+    "pair.npy": (
+        _headed("{'descr': ('<u2',), 'fortran_order': False, 'shape': ((),)}", _GREY),
+        "NPY",
+    ),
+    "is.npy": (
+        _headed("{'descr': '<u2', 'fortran_order': 1is 1, 'shape': (16, 16)}", _GREY),
+        "NPY",
+    ),
+    "deep.npy": (_headed("{'descr': '|u1', 'shape': " + "(" * 9000, _GREY), "damaged NPY"),
+    "alias.npy": (_headed("{'descr': 'a', 'fortran_order': False, 'shape': (2,)}", _GREY), "other"),
     "magic.npy": (b"\x93NUMPY\x09\x00" + bytes(99), "damaged NPY"),
     "eval.npy": (b"\x93NUMPY\x01\x00\x10\x00__import__('os')", "damaged NPY"),
 }
@@ -206,7 +228,7 @@ _BAD = {
 
 @pytest.mark.parametrize("name", sorted(_BAD))
 @pytest.mark.req("REQ-08")
-def test_bad_files_have_one_clear_line(tmp_path, name):
+def test_bad_files_have_one_clear_line(tmp_path, name, recwarn):
     data, words = _BAD[name]
     path = tmp_path / name
     path.write_bytes(data)
@@ -216,6 +238,24 @@ def test_bad_files_have_one_clear_line(tmp_path, name):
     assert message.startswith(f"{name}: ") and words in message
     assert "\n" not in message and str(tmp_path) not in message
     assert path.read_bytes() == data and len(list(tmp_path.iterdir())) == 1
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '|u1', 'fortran_order': False, 'shape': (32L, 32L), }",  # Python 2
+        "{'descr': '|u1', 'fortran_order': False, 'shape': (32, 32)}",
+        '{"shape": (32,32), "fortran_order": False, "descr": "uint8",}',
+        "{'shape':(32, 32,),'descr':'<u1','fortran_order':False}  \n",
+    ],
+)
+def test_npy_of_other_writers(tmp_path, header, recwarn):
+    (tmp_path / "p.npy").write_bytes(_headed(header, _GREY))
+    np.testing.assert_array_equal(read_picture(tmp_path / "p.npy")[0], _GREY)
+    np.save(tmp_path / "big.npy", _GREY.astype(">u2"))  # the other byte order
+    np.testing.assert_array_equal(read_picture(tmp_path / "big.npy")[0], _GREY)
+    assert not recwarn.list
 
 
 def test_of_a_damaged_tiff_only_the_error_tells(tmp_path, capfd):
