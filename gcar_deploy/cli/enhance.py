@@ -154,4 +154,4 @@ def _read(picture: Path, order: Order, meaning: Meaning) -> tuple[Any, list[str]
     angiogram = dataclasses.replace(angiogram, valid=valid, frame=chosen)
     runs = find_runs([picture], options)
     (angiogram,), more = with_bare([angiogram], runs, seen_runs(runs, None, options))
-    return angiogram, notes + more
+    return angiogram.in_range(), notes + more

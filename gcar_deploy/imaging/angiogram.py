@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from gcar_deploy.errors import ImageError
 from gcar_deploy.geometry.carm import CArm
@@ -17,6 +20,10 @@ if TYPE_CHECKING:  # only a name in annotations: pictures need no scene file
 
 #: longer side of the field at the isocentre where nothing is known of a picture, mm
 DEFAULT_FIELD_MM = 150.0
+#: kinds of intensity whose counts may be of any scale
+_ANY_SCALE = ("attenuation", "raw")
+#: largest counts between 2 to the minus this power and 2 to this power stay as they are
+MOST_EXPONENT = 32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,6 +80,20 @@ class Angiogram:
         for array in (self.valid, self.mask, self.erased, self.painted, *self.bare):
             if array is not None:
                 _check_shape(self.view_id, self.carm, array)
+
+    def in_range(self) -> Angiogram:
+        """Return the picture with counts whose squares single precision holds.
+
+        Only counts whose scale says nothing are scaled, and only where they need it; by a power
+        of two, so that each keeps its digits.
+        """
+        if self.intensity.kind not in _ANY_SCALE:
+            return self
+        exponent = math.frexp(max(float(one.max()) for one in (self.pixels, *self.bare)))[1]
+        if abs(exponent) <= MOST_EXPONENT:
+            return self
+        pixels, *bare = (np.ldexp(one, -exponent) for one in (self.pixels, *self.bare))
+        return dataclasses.replace(self, pixels=pixels, bare=tuple(bare))
 
     @classmethod
     def without_geometry(

@@ -87,6 +87,7 @@ def prepare(
         dataclasses.replace(one, file=Path(view).name) if isinstance(view, (str, Path)) else one
         for one, view in zip(angiograms, views, strict=True)
     ]
+    angiograms = [one.in_range() for one in angiograms]
     angiograms = with_masks(angiograms, masks, options.imaging.limits)
     notes += [f"view {k}: the vessel mask is the user's" for k in masks]
     for k, lines in (drawn or {}).items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
@@ -124,3 +125,35 @@ def test_a_geometry_of_numpys_numbers_is_taken():
     told["views"][0]["rows"] = np.True_
     with pytest.raises(GeometryError, match="rows = True"):
         prepare(pixels, told, RunOptions())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("power", [-100, -60, 100, 112])
+def test_counts_of_any_scale_are_the_same_picture(good_case, power):  # noqa: F811
+    """A product of two counts must be a number of single precision, and none must be 0."""
+    scene = json.loads((good_case / "geom.json").read_text())
+    for view in scene["views"]:
+        view["intensity"] = {"kind": "attenuation"}
+    views = [
+        cv2.imread(str(good_case / f"view{k}.png"), cv2.IMREAD_UNCHANGED).astype(np.float64)
+        for k in (1, 2)
+    ]
+    engine = Engine(options=THIN, threads=1)
+    usual = engine.reconstruct(views, scene)
+    other = engine.reconstruct([np.ldexp(view, power) for view in views], scene)
+    assert other.tree.length_mm == pytest.approx(usual.tree.length_mm, abs=1e-3)
+    assert other.status == usual.status
+
+
+def test_only_counts_far_out_are_scaled(good_case):  # noqa: F811
+    for kind in ("attenuation", "raw", "mask"):
+        scene = geometry()
+        for view in scene["views"]:
+            view["intensity"] = {"kind": kind}
+        rows, columns = scene["views"][0]["rows"], scene["views"][0]["columns"]
+        pixels = np.random.default_rng(3).random((rows, columns), np.float32)
+        for power in (-31, 0, 31, 99):
+            given = np.ldexp(pixels, power)
+            found = prepare([given, given], scene, RunOptions())[0][0].pixels
+            far = power == 99 and kind != "mask"
+            np.testing.assert_array_equal(found, pixels if far else given)
