@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from gcar_deploy.dicom.header import Header
+from gcar_deploy.dicom.header import JPEG, Header
 from gcar_deploy.errors import ImageError
 from gcar_deploy.types import Image
 
 #: JPEG markers that open a frame (SOF) carry its size; not DHT, JPG, DAC
 _SOF = {*range(0xC0, 0xD0), 0xF7} - {0xC4, 0xC8, 0xCC}
+#: how a stream of JPEG or JPEG-LS begins, one of JPEG 2000, and that as a file
+_STREAMS = (b"\xff\xd8", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP  ")
 
 
 class Frames:
@@ -107,6 +109,9 @@ class Frames:
         from pydicom.encaps import get_frame
 
         stream = get_frame(self._dataset.PixelData, index, number_of_frames=self.header.frames)
+        # Of what is none at all, the decoder writes to stderr before it fails.
+        if self.header.syntax.startswith(JPEG) and not stream.startswith(_STREAMS):
+            raise ValueError("no JPEG")
         size = stream_size(stream)
         if size is not None and size != (self.header.rows, self.header.columns):
             raise ValueError("size")

@@ -36,7 +36,8 @@ SYNTAXES = {
     "1.2.840.10008.1.2.4.90": False,  # JPEG 2000
     "1.2.840.10008.1.2.4.91": True,
 }
-_JPEG = "1.2.840.10008.1.2.4."
+#: how every kind of JPEG begins
+JPEG = "1.2.840.10008.1.2.4."
 #: what a decoder must be told of the pixels
 _COUNTS = (
     "Rows", "Columns", "BitsAllocated", "BitsStored", "SamplesPerPixel", "PixelRepresentation",
@@ -233,7 +234,7 @@ def _header(name: str, data: bytes, limits: DicomLimits) -> Header:
     if samples != 1 or signed or not 1 <= stored <= bits or grey not in _GREY:
         raise ValueError("holds colour or signed pixels; XA is unsigned grey")
     # Compressed streams hold whole cells of their own depth: where the bits lie is not for sure.
-    if not stored <= high + 1 <= (stored if syntax.startswith(_JPEG) else bits):
+    if not stored <= high + 1 <= (stored if syntax.startswith(JPEG) else bits):
         raise ValueError(
             f"has {tag('HighBit')} = {high}; for {stored} bits stored it must be {stored - 1}"
         )

@@ -69,6 +69,15 @@ def test_jpeg_lossless(tmp_path):
     refused(tmp_path, as_bytes(ds), "cannot be decoded")
 
 
+def test_a_fragment_that_is_no_jpeg(tmp_path, capfd):
+    """Its decoder would say so on stderr, beside the one line."""
+    packed = jpeg_lossless(save(classic(vessel_frames(3, 1)), tmp_path / "a.dcm"), tmp_path / "b")
+    ds = pydicom.dcmread(packed)
+    ds.PixelData = encapsulate([b"no JPEG at all!!"] * 3)
+    refused(tmp_path, as_bytes(ds), "cannot be decoded")
+    assert capfd.readouterr().err == ""
+
+
 def test_twelve_bits_and_an_overlay_above_them(tmp_path):
     frames = vessel_frames(2).astype(np.uint16) * 10
     ds = classic(frames | 0x8000, BitsStored=12, HighBit=11)
