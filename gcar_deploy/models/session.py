@@ -182,16 +182,25 @@ def _open(
 
 @contextlib.contextmanager
 def _watched(should_stop: Callable[[], bool] | None) -> Iterator[Any]:
-    """RunOptions whose run ends soon after ``should_stop`` says so; None without a question."""
+    """RunOptions whose run ends soon after ``should_stop`` says so; None without a question.
+
+    What the question raises is raised here, as it would be in the calling thread.
+    """
     if should_stop is None:
         yield None
         return
     options, over = ort.RunOptions(), threading.Event()
+    raised: list[BaseException] = []
 
     def watch() -> None:
         # Inference holds the calling thread for its whole length: only another one can ask.
         while not over.wait(WATCH_S):
-            if should_stop():
+            try:
+                stop = should_stop()
+            except BaseException as error:  # noqa: BLE001 - the caller's own; raised there
+                raised.append(error)
+                stop = True
+            if stop:
                 options.terminate = True
                 return
 
@@ -202,6 +211,8 @@ def _watched(should_stop: Callable[[], bool] | None) -> Iterator[Any]:
     finally:
         over.set()
         watcher.join()
+        if raised:
+            raise raised[0] from None
 
 
 def _first_line(error: Exception) -> str:

@@ -130,6 +130,22 @@ def test_a_running_segmenter_is_cancelled(raw, monkeypatch):
     assert not any(t.name == "gcar-watch" for t in threading.enumerate())
 
 
+def test_what_the_question_raises_is_raised_to_the_caller(raw, monkeypatch, capfd):
+    """In the other thread it would be printed, and forgotten."""
+    monkeypatch.setattr(session_module, "WATCH_S", 1e-3)
+    engine = Engine(options=HULL, threads=1)
+    engine.reconstruct(*raw)
+
+    def cancel():
+        if threading.current_thread().name == "gcar-watch":
+            raise ConnectionError("the host is gone")
+        return False
+
+    with pytest.raises(ConnectionError, match="the host is gone"):
+        engine.reconstruct(*raw, cancel=cancel)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.slow
 def test_the_deadline_reaches_a_running_segmenter(raw, monkeypatch):
     engine = Engine(options=HULL, threads=1)
