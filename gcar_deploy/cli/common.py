@@ -138,7 +138,11 @@ def say_result(text: str, folder: Path) -> None:
     from gcar_deploy.errors import GcarError
 
     try:
-        click.echo(text)
+        try:
+            click.echo(text)
+        except UnicodeEncodeError as error:
+            # A path in letters that the output has none for: what is told is told all the same.
+            click.echo(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
     except BrokenPipeError:
         raise
     except OSError as error:

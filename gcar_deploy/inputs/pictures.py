@@ -100,6 +100,8 @@ def _check_kinds(views: Sequence[Picture]) -> None:
     """Say at once what is no list of pictures: a string is a sequence as well."""
     if isinstance(views, (str, bytes)) or not isinstance(views, (Sequence, np.ndarray)):
         raise UsageError(f"views is a {type(views).__name__}; give a list of two or more pictures")
+    if isinstance(views, np.ndarray) and views.ndim == 0:
+        raise UsageError("views is one number; give a list of two or more pictures")
     if len(views) < 2:
         raise UsageError(f"{len(views)} picture given; two or more are needed")
     for number, view in enumerate(views, start=1):
@@ -186,6 +188,8 @@ def with_masks(
         place = _index(number, "mask", out)
         if isinstance(given, np.ndarray):
             array = _unmasked(f"mask {number}", given)
+            if array.dtype.kind not in "biuf":
+                raise ImageError(f"mask {number} holds {array.dtype}; give numbers or booleans")
         else:
             array = read_picture(given, limits, binary=True)[0]
         shape = out[place].pixels.shape
@@ -380,7 +384,7 @@ def _scene(geometry: Geometry) -> Scene:
     if isinstance(geometry, Mapping):
         try:
             return parse_scene(json.dumps(dict(geometry), default=_of_numpy), "geometry")
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             raise GeometryError(f"geometry cannot be written as JSON: {error}") from None
     if isinstance(geometry, str) and geometry.lstrip().startswith("{"):
         raise UsageError("geometry is JSON text; give a path, or json.loads of it")

@@ -83,9 +83,9 @@ def inlets(
             (branch.end, branch.radius_mm[-1]),
         ):
             thickest[node] = max(thickest.get(node, 0.0), float(radius))
-    free = {**end_radii(tree), **{node: thickest[node] for node in blunt}}
-    marked = {node for place in (() if marked_mm is None else marked_mm)
-              if (node := _end_at(tree, free, place)) is not None}  # fmt: skip
+    free = {**end_radii(tree), **{begin: thickest[begin] for begin in blunt}}
+    marked = {end for place in (() if marked_mm is None else marked_mm)
+              if (end := _end_at(tree, free, place)) is not None}  # fmt: skip
     component = tree.components()
     out = []
     for k in np.unique([component[node] for node in thickest]).tolist():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -95,6 +95,8 @@ def _drawn(result: Reconstruction, k: int) -> tuple[Backdrop, bytes]:
 
 def check_extras(extras: Sequence[str]) -> None:
     """Find out early whether extra files can be written; see ``render_files``."""
+    if not isinstance(extras, Collection):
+        raise UsageError(f"extras is a {type(extras).__name__}; give a list of {', '.join(EXTRAS)}")
     unknown = sorted(set(extras) - EXTRAS.keys())
     if unknown:
         raise UsageError(f"extra file {unknown[0]!r} is none of {', '.join(EXTRAS)}")

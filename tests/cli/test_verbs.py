@@ -334,6 +334,17 @@ def test_an_internal_error_is_one_line_unless_verbose(good_case, tmp_path, monke
     assert gcar(*verb).err == "gcar: error: internal error: ZeroDivisionError division\n"  # no -v
 
 
+def test_a_path_that_the_output_has_no_letters_for_is_told_all_the_same(tmp_path):
+    program = "from gcar_deploy.cli.common import say_result as s; import pathlib; "
+    program += "s('\\u65e5: \\xe9', pathlib.Path('x'))"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, check=False,
+        env={**os.environ, "PYTHONIOENCODING": "latin-1"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.decode("latin-1").strip() == "\\u65e5: \xe9"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_full_disk_behind_stdout_is_one_line_and_the_result_stays(good_case, tmp_path):

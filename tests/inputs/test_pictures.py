@@ -64,6 +64,23 @@ def test_masks_of_a_wrong_type(good_case, masks, words):  # noqa: F811
         Engine(options=THIN).reconstruct(files, geometry(), masks=masks)
 
 
+@pytest.mark.parametrize("kind", ["U4", "M8[s]", "c8", "u1,u1", "O"])
+def test_masks_that_hold_no_numbers(good_case, kind):  # noqa: F811
+    files = [good_case / "view1.png", good_case / "view2.png"]
+    with pytest.raises(ImageError, match=r"mask 1 holds .*; give numbers or booleans"):
+        Engine(options=THIN).reconstruct(files, geometry(), masks={1: np.zeros((96, 96), kind)})
+
+
+def test_what_is_no_list_of_pictures_nor_a_geometry(good_case):  # noqa: F811
+    deep = {"schema": "gcar-geometry/1"}
+    for _ in range(100_000):
+        deep = {"views": deep}
+    with pytest.raises(UsageError, match="views is one number"):
+        Engine(options=THIN).reconstruct(np.array(5), geometry())
+    with pytest.raises(GeometryError, match="geometry cannot be written as JSON"):
+        Engine(options=THIN).reconstruct([good_case / "view1.png"] * 2, deep)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_users_mask_of_nothing_or_of_far_too_much(good_case, share):  # noqa: F811
     files = [good_case / "view1.png", good_case / "view2.png"]
