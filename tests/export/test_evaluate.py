@@ -267,6 +267,7 @@ def test_changed_settings_are_redone_kept_or_refused_aloud(data, tmp_path, engin
     assert len(calls) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", ["another file", "no hash"])
 def test_rows_are_tied_to_their_label_file(data, tmp_path, monkeypatch, caplog, before):
     label = tmp_path / "data" / "1.nii.gz"
@@ -294,6 +295,7 @@ def test_rows_are_tied_to_their_label_file(data, tmp_path, monkeypatch, caplog, 
     evaluate.evaluate(evaluate.EvaluateOptions(**given, changed="refuse"))
 
 
+@pytest.mark.slow
 def test_a_label_that_no_case_can_be_made_of_is_a_row_with_its_reason(data, tmp_path):
     from click.testing import CliRunner
 

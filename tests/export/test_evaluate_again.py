@@ -37,6 +37,7 @@ def table(folder):
             for entry in json.loads((folder / "out" / "summary.json").read_text())}  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["", '{"case": "1"', "[]", '{"case": "1"}'])
 def test_a_damaged_row_is_named_and_made_anew(made, caplog, text):
     file = made / "out" / "rows" / "paper-1-2-visual_hull.json"

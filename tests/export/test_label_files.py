@@ -60,6 +60,7 @@ def test_a_folder_without_any_is_refused_with_what_lies_there(tmp_path):
     assert not (tmp_path / "run").exists() and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_training_and_the_table_of_trees_read_what_the_evaluation_reads(tmp_path):
     volume = np.zeros((50, 50, 70), np.uint8)
     for z in range(8, 62):

@@ -68,6 +68,7 @@ def test_a_line_is_learned_and_its_mean_is_kept(tmp_path):
     assert told["step"] == 150 and told["validation"]["slope"] == float(kept["mean.weight"])
 
 
+@pytest.mark.slow
 def test_a_run_in_pieces_is_a_run_in_one(tmp_path):
     begun = []
     for name, pieces in (("one", [60]), ("two", [23, 60])):

@@ -49,6 +49,7 @@ def test_rows_ask_the_model_of_their_kind_and_the_digest_says_so(tmp_path):
     assert finder.digest("ours-classic") == plain.digest("ours-classic")
 
 
+@pytest.mark.slow
 def test_an_own_model_is_used_named_in_the_table_and_tied_to_its_rows(data, tmp_path, caplog):
     given = {"data": data, "protocol": "paper", "methods": ("multi", "visual_hull"),
              "out": tmp_path / "out"}  # fmt: skip
@@ -82,6 +83,7 @@ def test_a_model_that_no_row_asks_is_refused(data, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_command_takes_the_model(data, tmp_path):
     from click.testing import CliRunner
 

@@ -256,6 +256,7 @@ def test_the_slower_of_two_runs_is_told_as_if_it_had_come_later(
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(
     ("number", "code"),

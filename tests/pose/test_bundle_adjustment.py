@@ -166,6 +166,7 @@ def test_rounds_of_tree_and_poses():
     assert bundled(views, still, never, RunOptions()) == still
 
 
+@pytest.mark.slow
 def test_views_that_are_told_rightly_stay():
     """Profiles may agree better elsewhere, but no tree explains as much of the lines there."""
     told, views, points = scene(4, 4)

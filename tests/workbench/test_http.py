@@ -141,6 +141,7 @@ def test_who_has_not_seen_a_correction_does_not_undo_it(ask, desk):
     assert "regions" in json.loads(case.order_file.read_text()) and list(case.order.edits) == [1]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_kept_is_not_taken(ask, desk, monkeypatch):
     case = desk.demo()
     stroke = [{"do": "erase", "width_px": 3, "points": [[9.5, 9]] * 2000}]

@@ -350,6 +350,7 @@ def slowly(port, header, *, seconds, wait_s=0.2):
     return None
 
 
+@pytest.mark.slow
 def test_a_stranger_that_drips_is_hung_up_on_and_who_bears_the_token_is_not(serving, monkeypatch):
     ask, _ = serving
     monkeypatch.setattr("gcar_deploy.worker.loopback._STRANGERS_S", 1.0)
