@@ -47,7 +47,7 @@ from gcar_deploy.quality import (
     kind_of,
 )
 from gcar_deploy.reconstruction import Reconstruction
-from gcar_deploy.second_look import check_second_look
+from gcar_deploy.second_look import SecondLook
 from gcar_deploy.steps import OnStep, Step
 from gcar_deploy.stopwatch import OnProgress, Stopwatch
 from gcar_deploy.tree.tree import Tree
@@ -180,7 +180,7 @@ def _reconstructed(
                 disagreement=placed.disagreement, evidence=centers.evidence,
             )  # fmt: skip
             if judged.status == OK and kind_of(placed.views) != "exact":
-                why = check_second_look(tree, placed.views, grid, predictor, options, watch)
+                why = SecondLook(placed.views, grid, predictor, options, watch).doubt(tree)
                 judged = judged if why is None else doubted(judged, tree, why)
         with watch.stage("diameters", keep_if_late=True):
             sections = measure_sections(tree, signals)

@@ -21,7 +21,7 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.predict import Predictor, find_centers, seen_by_all
 from gcar_deploy.quality import GHOST_MM
 from gcar_deploy.stopwatch import Stopwatch
-from gcar_deploy.tree.curves import resample
+from gcar_deploy.tree.curves import points_every
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.tubes import refine
 from gcar_deploy.types import Array, Points
@@ -35,65 +35,91 @@ SURE = 0.02
 _STEP_MM = 0.5
 
 
-def check_second_look(
-    tree: Tree,
-    views: Sequence[VesselImage],
-    grid: Grid,
-    predictor: Predictor | None,
-    options: RunOptions,
-    watch: Stopwatch,
-) -> str | None:
-    """Return why a tree is doubted that lies elsewhere once the scene is turned, if it does.
+@dataclasses.dataclass(frozen=True, eq=False)
+class SecondLook:
+    """What a tree was made with, to make it again.
 
-    As ``elsewhere``, but late there is a reason as well.
-    """
-    try:
-        share = elsewhere(tree, views, grid, predictor, options, watch)
-    except CancelledError:
-        if watch.cancelled:
-            raise
-        return "the deadline left no time for a second look: branches may lie elsewhere"
-    if share <= options.quality.good_second_look:
-        return None
-    return (
-        f"made again of the same pictures with the scene turned, {share:.0%} of the tree lies "
-        f"elsewhere (at most {options.quality.good_second_look:.0%} is usual): they leave open "
-        "which vessel is which; a third view would tell"
-    )
-
-
-def elsewhere(
-    tree: Tree,
-    views: Sequence[VesselImage],
-    grid: Grid,
-    predictor: Predictor | None,
-    options: RunOptions,
-    watch: Stopwatch,
-) -> float:
-    """Share of a tree that lies elsewhere once the scene is turned, the most of the turns tried.
-
-    Parameters
+    Attributes
     ----------
-    tree : Tree of these views, mm LPS; its inlets do not matter
-    views, grid, predictor, options : as it was made with
+    views, grid, predictor, options : as the tree was made with
     watch : Stopwatch, whose budget ends the refinement
-
-    Returns
-    -------
-    0 .. 1, the mean of both trees' shares that lie further than ``GHOST_MM`` from the other
-
-    Raises
-    ------
-    CancelledError
-        Cancelled or late.
     """
-    own, most = _points(tree), 0.0
-    for deg in TURNS_DEG:
-        there = _tree_turned(views, grid, predictor, options, watch, about_z(deg))
-        most = max(most, _apart(own, _points(there)))
-        if not SURE < most <= options.quality.good_second_look:
-            break
-    return most
+
+    views: Sequence[VesselImage]
+    grid: Grid
+    predictor: Predictor | None
+    options: RunOptions
+    watch: Stopwatch
+
+    def doubt(self, tree: Tree) -> str | None:
+        """Return why a tree is doubted that lies ``elsewhere``, if it does; late is a reason, too.
+
+        Raises
+        ------
+        CancelledError
+            Cancelled.
+        """
+        most = self.options.quality.good_second_look
+        try:
+            share = self.elsewhere(tree)
+        except CancelledError:
+            if self.watch.cancelled:
+                raise
+            return "the deadline left no time for a second look: branches may lie elsewhere"
+        if share <= most:
+            return None
+        return (
+            f"made again of the same pictures with the scene turned, {share:.0%} of the tree lies "
+            f"elsewhere (at most {most:.0%} is usual): they leave open which vessel is which; "
+            "a third view would tell"
+        )
+
+    def elsewhere(self, tree: Tree) -> float:
+        """Share of a tree that lies elsewhere once the scene is turned, the most of turns tried.
+
+        Parameters
+        ----------
+        tree : Tree, mm LPS; its inlets do not matter
+
+        Returns
+        -------
+        0 .. 1, the mean of both trees' shares that lie further than ``GHOST_MM`` from the other
+
+        Raises
+        ------
+        CancelledError
+            Cancelled or late.
+        """
+        own, most = points_every(tree, _STEP_MM), 0.0
+        for deg in TURNS_DEG:
+            most = max(most, _apart(own, points_every(self._turned(deg), _STEP_MM)))
+            if not SURE < most <= self.options.quality.good_second_look:
+                break
+        return most
+
+    def _turned(self, deg: float) -> Tree:
+        """Make the tree of the scene turned by ``about_z``, and turn it back."""
+
+        def turned(view: VesselImage) -> VesselImage:
+            others = tuple(turned(other) for other in view.others)
+            return dataclasses.replace(
+                view, carm=carm_turned(view.carm, deg), others=others, kept=None
+            )
+
+        turn, options, predictor = about_z(deg), self.options, self.predictor
+        there = [turned(view) for view in self.views]
+        x, y, z = (turn @ np.asarray(self.grid.center_mm)).tolist()
+        grid = dataclasses.replace(self.grid, center_mm=(x, y, z))
+        seen = seen_by_all(there, grid, options, predictor)
+        centers = find_centers(seen, predictor, options, self.watch)
+        told = None if centers.evidence is None else centers.evidence.points
+        budget = self.watch.budget()
+        refined = refine(centers.points, there, options.refine, None, budget, told).or_fail()
+        tree = refined.tree
+        back = [dataclasses.replace(b, points_mm=b.points_mm @ turn) for b in tree.branches]
+        here = dataclasses.replace(tree, nodes_mm=tree.nodes_mm @ turn, branches=tuple(back))
+        kept, _ = refined.with_tree(here).without(options.deleted_mm)
+        return kept.tree
 
 
 def about_z(deg: float) -> Array:
@@ -102,45 +128,11 @@ def about_z(deg: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def carm_turned(carm: CArm, turn: Array) -> CArm:
+def carm_turned(carm: CArm, deg: float) -> CArm:
     """Return the view that shows a scene turned by ``about_z`` as ``carm`` shows it now."""
-    told = carm.turned(float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))))
-    x, y, z = (turn @ told.isocenter_offset_mm).tolist()
+    told = carm.turned(deg)
+    x, y, z = (about_z(deg) @ told.isocenter_offset_mm).tolist()
     return dataclasses.replace(told, isocenter_offset_mm=(x, y, z))
-
-
-def _tree_turned(
-    views: Sequence[VesselImage],
-    grid: Grid,
-    predictor: Predictor | None,
-    options: RunOptions,
-    watch: Stopwatch,
-    turn: Array,
-) -> Tree:
-    """Make the tree of a scene that is turned, and turn it back."""
-
-    def turned(view: VesselImage) -> VesselImage:
-        others = tuple(turned(other) for other in view.others)
-        carm = carm_turned(view.carm, turn)
-        return dataclasses.replace(view, carm=carm, others=others, kept=None)
-
-    there = [turned(view) for view in views]
-    x, y, z = (turn @ np.asarray(grid.center_mm)).tolist()
-    seen = seen_by_all(there, dataclasses.replace(grid, center_mm=(x, y, z)), options, predictor)
-    centers = find_centers(seen, predictor, options, watch)
-    told = None if centers.evidence is None else centers.evidence.points
-    refined = refine(centers.points, there, options.refine, None, watch.budget(), told).or_fail()
-    tree = refined.tree
-    back = [dataclasses.replace(b, points_mm=b.points_mm @ turn) for b in tree.branches]
-    here = dataclasses.replace(tree, nodes_mm=tree.nodes_mm @ turn, branches=tuple(back))
-    kept, _ = refined.with_tree(here).without(options.deleted_mm)
-    return kept.tree
-
-
-def _points(tree: Tree) -> Points:
-    return np.concatenate(
-        [np.zeros((0, 3)), *(resample(b.points_mm, _STEP_MM) for b in tree.branches)]
-    )
 
 
 def _apart(one: Points, other: Points) -> float:

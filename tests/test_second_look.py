@@ -9,7 +9,7 @@ from gcar_deploy import CArm, Engine
 from gcar_deploy.config import RunOptions
 from gcar_deploy.errors import CancelledError
 from gcar_deploy.reconstruct import STAGES
-from gcar_deploy.second_look import about_z, carm_turned, check_second_look, elsewhere
+from gcar_deploy.second_look import SecondLook, about_z, carm_turned
 from gcar_deploy.selftest import tiny_case
 from gcar_deploy.stopwatch import Stopwatch
 from gcar_deploy.tree.tree import empty_tree
@@ -28,7 +28,7 @@ def view(primary, secondary, rotation=7.0, offset=(3.0, -8.0, 5.0)):
 def test_a_turned_view_shows_a_turned_scene_as_it_was(angles, deg):
     points = np.random.default_rng(1).uniform(-50, 50, (20, 3))
     carm, turn = view(*angles), about_z(deg)
-    pixels, depth = carm_turned(carm, turn).project(points @ turn.T)
+    pixels, depth = carm_turned(carm, deg).project(points @ turn.T)
     np.testing.assert_allclose(pixels, carm.project(points)[0], atol=1e-8)
     np.testing.assert_allclose(depth, carm.project(points)[1], atol=1e-8)
     np.testing.assert_allclose(turn @ [np.cos(0.3), np.sin(0.3), 2.0], [
@@ -57,27 +57,27 @@ def moved(tree, share, far_mm):
 
 def test_what_the_pictures_decide_comes_out_again(made):
     tree, how = made
-    assert elsewhere(tree, *how, Stopwatch(STAGES)) < 0.02
-    assert check_second_look(tree, *how, Stopwatch(STAGES)) is None
+    assert SecondLook(*how, Stopwatch(STAGES)).elsewhere(tree) < 0.02
+    assert SecondLook(*how, Stopwatch(STAGES)).doubt(tree) is None
 
 
 def test_what_comes_out_elsewhere_is_told_with_its_share(made):
     tree, how = made
     for share in (0.25, 0.5):
-        found = elsewhere(moved(tree, share, 20.0), *how, Stopwatch(STAGES))
+        found = SecondLook(*how, Stopwatch(STAGES)).elsewhere(moved(tree, share, 20.0))
         assert found == pytest.approx(share, abs=0.08)
-        said = check_second_look(moved(tree, share, 20.0), *how, Stopwatch(STAGES))
+        said = SecondLook(*how, Stopwatch(STAGES)).doubt(moved(tree, share, 20.0))
         assert f"{found:.0%} of the tree lies elsewhere" in said
-    assert elsewhere(empty_tree(), *how, Stopwatch(STAGES)) == 1.0
+    assert SecondLook(*how, Stopwatch(STAGES)).elsewhere(empty_tree()) == 1.0
 
 
 def test_without_time_it_is_said_that_nobody_looked_and_cancelled_is_cancelled(made):
     tree, how = made
-    assert "no time for a second look" in check_second_look(
-        tree, *how, Stopwatch(STAGES, deadline_s=1e-3, used_s=1.0)
-    )
+    assert "no time for a second look" in SecondLook(
+        *how, Stopwatch(STAGES, deadline_s=1e-3, used_s=1.0)
+    ).doubt(tree)
     with pytest.raises(CancelledError):
-        check_second_look(tree, *how, Stopwatch(STAGES, cancel=lambda: True))
+        SecondLook(*how, Stopwatch(STAGES, cancel=lambda: True)).doubt(tree)
 
 
 @pytest.mark.slow

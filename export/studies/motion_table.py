@@ -36,7 +36,7 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.measure.metrics import best_shifted_dice
 from gcar_deploy.pose import registration
-from gcar_deploy.tree.curves import resample
+from gcar_deploy.tree.curves import points_every, resample
 from gcar_deploy.types import Points
 from gcar_export.scenes.motion import heart_motion, moved_tree
 from gcar_export.scenes.protocols import MM_PER_COUNT, case_geometry
@@ -136,7 +136,7 @@ def one(protocol: str, number: int, level_mm: float, arm: str, engine: Engine) -
         return dataclasses.replace(row, findings=(str(error),))
     rays = [c.project(p)[0] for c, p in zip(pair.carms, (first, second), strict=True)]
     best, _ = triangulate(pair.carms, rays)
-    found = np.concatenate([resample(b.points_mm, 1.0) for b in result.tree.branches])
+    found = points_every(result.tree, 1.0)
     laid = aligned(found, best)
     phases = (*pair.trees, moved_halfway(*pair.trees))
     return dataclasses.replace(

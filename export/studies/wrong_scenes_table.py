@@ -15,7 +15,7 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.quality.status import OK, REFUSED
 from gcar_deploy.result import Result
-from gcar_deploy.tree.curves import resample
+from gcar_deploy.tree.curves import points_every
 from gcar_deploy.types import Points
 from gcar_export.studies.wrong_scenes import PICTURES, VIEWS, Exam, Told, exam, wrong_scenes
 
@@ -127,7 +127,7 @@ def examined(
         status, sentence = REFUSED, str(error)
     else:
         status, sentence = result.quality.status, "; ".join(result.quality.findings)
-        error_mm = shape_error_mm(_line(result), case.line_mm)
+        error_mm = shape_error_mm(points_every(result.tree, 0.5), case.line_mm)
         score = score_of(result, case.pictures == "path_length")
         gap_px = _gaps_px(result)
     family, change, shows = what
@@ -172,10 +172,6 @@ def shape_error_mm(found: Points, truth: Points, steps: int = 30) -> float:
         steps_mm = np.concatenate([truth[index] - moved, truth - moved[other]])
         moved = moved + np.median(steps_mm, axis=0)
     return least
-
-
-def _line(result: Result) -> Points:
-    return np.concatenate([resample(branch.points_mm, 0.5) for branch in result.tree.branches])
 
 
 def write_csv(rows: Sequence[Row], file: Path) -> None:

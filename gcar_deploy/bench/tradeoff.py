@@ -27,8 +27,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.imaging.resample import area_average
 from gcar_deploy.inputs.pictures import prepare
 from gcar_deploy.measure.metrics import volume_dice
-from gcar_deploy.tree.curves import resample
-from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tree.curves import points_every
 from gcar_deploy.types import Points, Volume
 
 #: noise of a vessel's position in the finest picture for the bound, pixels
@@ -265,7 +264,7 @@ def _row(
         if pair is not None:
             units.append(seconds[-1] / pair())
     # Both ways, so that neither a ghost nor a missing branch comes free.
-    made = _dense(result.tree)
+    made = points_every(result.tree, 0.25)
     there = cKDTree(case.centreline_mm).query(made)[0]
     missed = cKDTree(made).query(case.centreline_mm)[0]
     rmse = float(np.sqrt(0.5 * (np.mean(there**2) + np.mean(missed**2))))
@@ -283,11 +282,6 @@ def _row(
         p95_mm=float(np.quantile(np.concatenate([there, missed]), 0.95)),
         over_bound=rmse / bound_mm,
     )
-
-
-def _dense(tree: Tree) -> Points:
-    """(n, 3) points along all branches, at most a quarter of a millimetre apart."""
-    return np.concatenate([resample(branch.points_mm, 0.25) for branch in tree.branches])
 
 
 def front(rows: Sequence[Row]) -> list[Row]:

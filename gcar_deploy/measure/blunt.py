@@ -12,7 +12,6 @@ import dataclasses
 import numpy as np
 
 from gcar_deploy.measure.routes import END_MM
-from gcar_deploy.tree.edit import part_of
 from gcar_deploy.tree.tree import Branch, Tree, polyline_arc
 from gcar_deploy.types import Array, Scalars
 
@@ -44,21 +43,6 @@ def blunt_begins(tree: Tree) -> list[Blunt]:
     """Find where vessels end bluntly in a thin one, looking outward from forks."""
     found = (_blunt(*_outward(tree, node)) for node in np.flatnonzero(tree.degrees == 1).tolist())
     return [one for one in found if one is not None]
-
-
-def parted(tree: Tree, blunt: Blunt) -> tuple[Tree, int]:
-    """Return the tree with a node at a blunt beginning, and that node's number."""
-    own = tree.branches[blunt.branch]
-    for node, point in ((own.start, 0), (own.end, len(own) - 1)):
-        if blunt.point == point:
-            return tree, node
-    number = len(tree.nodes_mm)
-    before = dataclasses.replace(part_of(own, 0, blunt.point), start=own.start, end=number)
-    behind = dataclasses.replace(part_of(own, blunt.point, len(own) - 1), start=number, end=own.end)
-    branches = list(tree.branches)
-    branches[blunt.branch : blunt.branch + 1] = [before, behind]
-    nodes = np.concatenate([tree.nodes_mm, own.points_mm[[blunt.point]]])
-    return dataclasses.replace(tree, nodes_mm=nodes, branches=tuple(branches)), number
 
 
 def _outward(tree: Tree, tip: int) -> tuple[Array, Scalars, Scalars, bool]:

@@ -21,9 +21,10 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from gcar_deploy.measure.blunt import blunt_begins, parted
+from gcar_deploy.measure.blunt import blunt_begins
 from gcar_deploy.measure.naming import read_anatomy
 from gcar_deploy.measure.routes import end_radii
+from gcar_deploy.tree.edit import parted
 from gcar_deploy.tree.rooted import rooted
 from gcar_deploy.tree.tree import Tree
 from gcar_deploy.types import Points
@@ -59,11 +60,10 @@ def _parted_at_blunt(tree: Tree) -> tuple[Tree, set[int]]:
     """Return the tree with a node at every blunt beginning that may be an inlet, and those."""
     nodes: set[int] = set()
     free, component = end_radii(tree), tree.components()
-    # The last ones first: parting a branch moves the numbers of those behind it.
-    for one in sorted(blunt_begins(tree), key=lambda one: (-one.branch, -one.point)):
+    for one in blunt_begins(tree):
         own = component[tree.branches[one.branch].start]
         if one.radius_mm > BLUNTLY * max(r for n, r in free.items() if component[n] == own):
-            tree, node = parted(tree, one)
+            tree, node = parted(tree, one.branch, one.point)
             nodes.add(node)
     return tree, nodes
 

@@ -125,9 +125,8 @@ def register(
         scale = one.scale, one.scaled, one.scale_gain
         lone = one.uncovered_mm
         findings += check_asked(ids, one.given, turn, scale, options.quality, lone)
-    moves = [(pose.shift_mm, pose.turn_deg) for pose in poses]
-    offsets = [pose.offset_mm for pose in poses]
-    findings += check_poses(views, moves, options.quality, offsets)
+    moves = [(pose.offset_mm, pose.turn_deg) for pose in poses]
+    findings += check_poses(views, moves, options.quality)
     findings += _unfinished(views, poses) + _marked_apart(views, poses)
     after, partners = [pose.after for pose in poses], [pose.partner for pose in poses]
     refusal = ""

@@ -222,29 +222,28 @@ def check_order(
 
 def check_poses(
     views: Sequence[VesselImage],
-    corrections: Sequence[tuple[float, float]],
+    corrections: Sequence[tuple[Sequence[float], float]],
     options: QualityOptions,
-    offsets_mm: Sequence[Sequence[float]] = (),
 ) -> list[str]:
     """Judge the estimated corrections between the runs.
 
     Parameters
     ----------
     views : V vessel images
-    corrections : (V,) shift in mm and larger turn in deg of each view
-    offsets_mm : (V, 3) the shifts themselves, where they are known
+    corrections : (V,) shift (3,) in mm and larger turn in deg of each view
     """
     findings = []
     hidden = ": the same move within the plane of the beams would leave no trace"
     # Exact profiles agree to a part in a hundred, and a cut vessel takes more from one of them.
     cut = [view.view_id for view in views if view.calibrated and is_cut(view)]
-    for number, (view, (shift, turn)) in enumerate(zip(views, corrections, strict=True)):
+    for view, (offset_mm, turn) in zip(views, corrections, strict=True):
+        shift = float(np.linalg.norm(offset_mm))
         if shift > options.good_shift_mm or turn > options.good_turn_deg:
             findings.append(
                 f"view {view.view_id} had to be moved by {shift:.1f} mm and turned by "
                 f"{turn:.1f} deg to agree (up to {options.good_shift_mm:g} mm and "
                 f"{options.good_turn_deg:g} deg are usual)"
-                + (along_a_beam(views, offsets_mm[number]) if offsets_mm else "")
+                + along_a_beam(views, offset_mm)
                 + (hidden if len(views) == 2 else "")
             )
         elif shift > CUT_SHIFT_MM and view.calibrated and cut:

@@ -64,6 +64,12 @@ def resample(points_mm: Points, step_mm: float) -> Points:
     return along(points_mm, arc, np.linspace(0.0, arc[-1], count))
 
 
+def points_every(tree: Tree, step_mm: float) -> Points:
+    """(n, 3) points along all branches, about ``step_mm`` apart; (0, 3) of an empty tree."""
+    lines = (resample(branch.points_mm, step_mm) for branch in tree.branches)
+    return np.concatenate([np.zeros((0, 3)), *lines])
+
+
 def smooth_line(points_mm: Points, weight: Scalars, sigma_steps: float) -> Points:
     """Gaussian-weighted mean along a line; the ends stay where they are."""
     if len(points_mm) < 3 or sigma_steps <= 0:

@@ -92,23 +92,14 @@ def with_branch(
     Tree
         The branch that is left is cut in two there, unless it ends there.
     """
-    nodes, branches = list(tree.nodes_mm), list(tree.branches)
-    start = len(nodes)
     nearest = _nearest(tree, points_mm[0])
     if nearest is not None and nearest[2] <= within_mm:
-        number, at, _ = nearest
-        branch = branches[number]
-        if at in (0, len(branch) - 1):
-            start = branch.end if at else branch.start
-        else:
-            nodes.append(branch.points_mm[at])
-            branches[number] = dataclasses.replace(part_of(branch, 0, at), end=start)
-            rest = part_of(branch, at, len(branch) - 1)
-            branches.append(dataclasses.replace(rest, start=start))
+        tree, start = parted(tree, *nearest[:2])
+        nodes = list(tree.nodes_mm)
         # The first place gives way to the node, so that no step is next to nothing.
         points_mm = np.concatenate([nodes[start][None], points_mm[1:]])
     else:
-        nodes.append(points_mm[0])
+        start, nodes = len(tree.nodes_mm), [*tree.nodes_mm, points_mm[0]]
     line = resample(points_mm, NEW_STEP_MM)
     same = np.ones(len(line))
     new = Branch(
@@ -116,7 +107,22 @@ def with_branch(
         confidence=confidence * same, start=start, end=len(nodes),
     )  # fmt: skip
     nodes.append(line[-1])
-    return merged(Tree(nodes_mm=np.array(nodes), branches=(*branches, new)))
+    return merged(Tree(nodes_mm=np.array(nodes), branches=(*tree.branches, new)))
+
+
+def parted(tree: Tree, number: int, at: int) -> tuple[Tree, int]:
+    """Return the tree with a node at a branch's point, and that node's number.
+
+    What lies behind the point becomes the last branch; nothing changes where a node is there.
+    """
+    branch, node = tree.branches[number], len(tree.nodes_mm)
+    if at in (0, len(branch) - 1):
+        return tree, branch.end if at else branch.start
+    branches = list(tree.branches)
+    branches[number] = dataclasses.replace(part_of(branch, 0, at), end=node)
+    branches.append(dataclasses.replace(part_of(branch, at, len(branch) - 1), start=node))
+    nodes = np.concatenate([tree.nodes_mm, branch.points_mm[[at]]])
+    return Tree(nodes_mm=nodes, branches=tuple(branches)), node
 
 
 def reversed_branch(branch: Branch) -> Branch:

@@ -280,7 +280,7 @@ MUTANTS = (
     Mutant(
         "views: validate does not judge the poses",
         "gcar_deploy/pose/registration.py",
-        "findings += check_poses(views, moves, options.quality, offsets)",
+        "findings += check_poses(views, moves, options.quality)",
         "findings += []",
         ("tests/test_inspection.py::test_three_views_are_placed_as_run_places_them",),
     ),

@@ -148,9 +148,10 @@ def test_too_little(case):
 def test_a_large_correction_between_the_runs_is_degraded(case):
     views = case[1]
     limit, turn = OPTIONS.good_shift_mm, OPTIONS.good_turn_deg
-    assert check_poses(views, [(0.0, 0.0), (limit, turn)], OPTIONS) == []
-    for correction in ((limit + 0.1, 0.0), (0.0, turn + 0.1)):
-        (finding,) = check_poses(views, [(0.0, 0.0), correction], OPTIONS)
+    still = ((0.0, 0.0, 0.0), 0.0)
+    assert check_poses(views, [still, ((0.0, limit, 0.0), turn)], OPTIONS) == []
+    for correction in (((0.0, limit + 0.1, 0.0), 0.0), ((0.0, 0.0, 0.0), turn + 0.1)):
+        (finding,) = check_poses(views, [still, correction], OPTIONS)
         assert "view 2 had to be moved" in finding
 
 
@@ -160,13 +161,13 @@ def test_a_shift_along_a_beam_asks_for_that_views_scale(case, number):
     beam = views[number].carm.axes[2]
     aside = np.cross(beam, views[1 - number].carm.axes[2])
     for offset, asks in ((-40 * beam, True), (40 * aside, False), (9 * beam, False)):
-        moves = [(0.0, 0.0), (float(np.linalg.norm(offset)), 0.0)]
-        (finding,) = check_poses(views, moves, OPTIONS, [np.zeros(3), offset])
+        (finding,) = check_poses(views, [(np.zeros(3), 0.0), (offset, 0.0)], OPTIONS)
         assert ("SOD" in finding) == asks
         share = 40 / views[number].carm.sod_mm
         said = f"beam of view {number + 1}, as where"
         assert (said in finding and f"some {share:.0%} off" in finding) == asks
-    (alone,) = check_poses(views, moves, OPTIONS)
+    turned = (np.zeros(3), OPTIONS.good_turn_deg + 1)
+    (alone,) = check_poses(views, [(np.zeros(3), 0.0), turned], OPTIONS)
     assert "SOD" not in alone
 
 
