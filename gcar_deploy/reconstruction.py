@@ -25,7 +25,7 @@ from gcar_deploy.geometry.observability import (
 )
 from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.square import on_given_pixels
+from gcar_deploy.imaging.own_frame import found_as_given
 from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
@@ -168,10 +168,8 @@ class Reconstruction:
             for p in places
         )
         views = tuple(
-            dataclasses.replace(
-                on_given_pixels(self.views[p], angiogram.carm), carm=pose.applied(angiogram.carm)
-            )
-            for p, pose, angiogram in zip(places, poses, angiograms, strict=True)
+            dataclasses.replace(found, carm=pose.applied(found.carm))
+            for found, pose in zip(found_as_given(frame, self.views), poses, strict=True)
         )
         stills = tuple(pose.still(a) for pose, a in zip(poses, angiograms, strict=True))
         judged = tuple(self.quality.views[p] for p in places)

@@ -33,12 +33,12 @@ class OwnFrame:
     ----------
     order : (V,) which view of the file stands first, second ...
     origin_mm : (3,) the scene's middle in the file's coordinates, mm LPS
-    sdd_mm : (V,) source to detector in that order, as told; ``carm`` does not keep it
+    given : (V,) views as they were given, in the file's order
     """
 
     order: tuple[int, ...]
     origin_mm: Points
-    sdd_mm: tuple[float, ...]
+    given: tuple[CArm, ...]
 
     def place(self, view: int) -> int:
         """Return where the file's view stands in the scene's own order."""
@@ -87,7 +87,7 @@ def own_frame(carms: Sequence[CArm], names: Sequence[str]) -> OwnFrame:
     origin = nearest_point(
         np.stack([carms[k].source_mm for k in order]), np.stack([carms[k].axes[2] for k in order])
     )
-    return OwnFrame(tuple(order), origin, tuple(carms[k].sdd_mm for k in order))
+    return OwnFrame(tuple(order), origin, tuple(carms))
 
 
 def _order(carms: Sequence[CArm], names: Sequence[str]) -> list[int]:

@@ -81,7 +81,7 @@ def on_given_pixels(found: VesselImage, carm: CArm) -> VesselImage:
     Parameters
     ----------
     found : VesselImage, as of a ``squared`` picture
-    carm : the view as it was given; the result has this one
+    carm : the view that was ``squared``, to the last digit; the result has this one
     """
     scales = square_scales(carm)
     if scales == (1.0, 1.0):

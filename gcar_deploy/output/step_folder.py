@@ -28,6 +28,7 @@ import numpy as np
 from gcar_deploy.errors import GcarError
 from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.imaging.angiogram import VesselImage
+from gcar_deploy.imaging.own_frame import found_as_given
 from gcar_deploy.imaging.vessels import Vessels
 from gcar_deploy.output.folder import check_target
 from gcar_deploy.output.overlay import png_bytes
@@ -62,8 +63,7 @@ class StepFolder:
     def __init__(self, folder: Path) -> None:
         check_target(folder, force=False)
         self._folder = folder
-        self._origin_mm: Points = np.zeros(3)
-        self._sdd_mm: tuple[float, ...] = ()
+        self._frame: OwnFrame | None = None
         try:
             folder.mkdir(parents=True)
         except OSError as error:
@@ -72,10 +72,12 @@ class StepFolder:
     def __call__(self, step: Step) -> None:
         """Write a step."""
         if isinstance(step, OwnFrame):
-            self._origin_mm, self._sdd_mm = step.origin_mm, step.sdd_mm
+            self._frame = step
             return
+        if self._frame is None:
+            raise ValueError("a step came before the frame that it stands in")
         try:
-            for name, data in self._files(step):
+            for name, data in _files(step, self._frame):
                 (self._folder / name).write_bytes(data)
         except OSError as error:
             raise self._refused(error) from None
@@ -83,30 +85,30 @@ class StepFolder:
     def _refused(self, error: OSError) -> GcarError:
         return GcarError(f"{self._folder} cannot be written ({error.strerror or error})")
 
-    def _files(self, step: Step) -> _Files:
-        if isinstance(step, Vessels):
-            for view in step.views:
-                yield from _pictures(view)
-        elif isinstance(step, Registered):
-            for view in step.views:
-                yield f"2-pose-view{_name(view)}-mask.png", _drawn(view.mask)
-            each = [_beam(*one) for one in zip(step.views, self._sdd_mm, strict=True)]
-            beams = np.concatenate(each) + self._origin_mm
-            names = [_name(view) for view in step.views]
-            yield "2-pose.vtp", poly_data(beams, [3] * len(names), {}, {"View": names})
-        elif isinstance(step, Seen):
-            points = step.hull.points_mm + self._origin_mm
-            yield "3-hull.vtp", poly_data(points, None, {}, {})
-        elif isinstance(step, Centers):
-            data = {"Confidence": step.points.confidence}
-            if step.evidence is not None:
-                data["Evidence"] = step.evidence.points.confidence
-            points = step.points.points_mm + self._origin_mm
-            yield "4-points.vtp", poly_data(points, None, data, {})
-        elif not isinstance(step, OwnFrame):
-            before = build_tree(step.centers)
-            yield "5-tree-before.vtp", _lines(before.moved(self._origin_mm))
-            yield "5-tree-after.vtp", _lines(step.tree.moved(self._origin_mm))
+
+def _files(step: Step, frame: OwnFrame) -> _Files:
+    if isinstance(step, Vessels):
+        for view in found_as_given(frame, step.views):
+            yield from _pictures(view)
+    elif isinstance(step, Registered):
+        for view in found_as_given(frame, step.views):
+            yield f"2-pose-view{_name(view)}-mask.png", _drawn(view.mask)
+        sdd_mm = [frame.given[k].sdd_mm for k in frame.order]
+        each = [_beam(*one) for one in zip(step.views, sdd_mm, strict=True)]
+        names = [_name(view) for view in step.views]
+        beams = np.concatenate(each) + frame.origin_mm
+        yield "2-pose.vtp", poly_data(beams, [3] * len(names), {}, {"View": names})
+    elif isinstance(step, Seen):
+        yield "3-hull.vtp", poly_data(step.hull.points_mm + frame.origin_mm, None, {}, {})
+    elif isinstance(step, Centers):
+        data = {"Confidence": step.points.confidence}
+        if step.evidence is not None:
+            data["Evidence"] = step.evidence.points.confidence
+        yield "4-points.vtp", poly_data(step.points.points_mm + frame.origin_mm, None, data, {})
+    elif not isinstance(step, OwnFrame):
+        before = build_tree(step.centers)
+        yield "5-tree-before.vtp", _lines(before.moved(frame.origin_mm))
+        yield "5-tree-after.vtp", _lines(step.tree.moved(frame.origin_mm))
 
 
 def _name(view: VesselImage) -> str:

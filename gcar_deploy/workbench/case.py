@@ -26,6 +26,7 @@ from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.geometry.scene import Scene, View, parse_scene, scene_to_json
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.chosen_frame import ChosenFrame
+from gcar_deploy.imaging.own_frame import found_as_given
 from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.read import read_picture
 from gcar_deploy.imaging.vessels import Vessels
@@ -146,8 +147,7 @@ class Case:
         if isinstance(step, OwnFrame):
             self._frame = step
         elif isinstance(step, Vessels) and self._frame is not None:
-            places = map(self._frame.place, range(len(step.views)))
-            self.vessels = tuple(step.views[place] for place in places)
+            self.vessels = found_as_given(self._frame, step.views)
 
     def angiograms(self) -> tuple[Angiogram, ...]:
         """Pictures with their geometry as it is told, without what was drawn in them.

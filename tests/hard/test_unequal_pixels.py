@@ -30,6 +30,11 @@ from tests.hard.phantoms import (
 TALL = {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.6, 1.2)}
 WIDE = {"rows": 128, "columns": 256, "pixel_spacing_mm": (1.2, 0.6)}
 FINE = {"rows": 256, "columns": 256, "pixel_spacing_mm": (0.6, 0.6)}
+#: the same field a little smaller, whose views in the scene's own frame round to other sides
+ROUNDED = [
+    {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.49, 0.98), "sdd_mm": 1299.0},
+    {"rows": 256, "columns": 205, "pixel_spacing_mm": (0.71, 0.8875), "sdd_mm": 1265.0},
+]
 MASK = Intensity(kind="mask", polarity="bright", mm_per_count=None)
 
 
@@ -132,7 +137,9 @@ def test_a_border_more_leaves_the_pixels_where_they_were(shape, border):
     np.testing.assert_allclose(offset, more[::-1], atol=1e-9)
 
 
-@pytest.mark.parametrize("shape", [TALL, WIDE, {"principal_point_px": (50.3, 81.7)} | TALL])
+@pytest.mark.parametrize(
+    "shape", [TALL, WIDE, {"principal_point_px": (50.3, 81.7)} | TALL, *ROUNDED]
+)
 def test_what_was_found_comes_back_on_the_pixels_that_were_given(engine, shape):
     tree, taken = straight((0.0, 0.1, 1.0), radius=2.0), views(shape, shape)
     pictures = paths(tree, taken)
@@ -146,8 +153,9 @@ def test_what_was_found_comes_back_on_the_pixels_that_were_given(engine, shape):
             assert abs(middles[0] - middles[1]) < 0.05
 
 
-def test_marks_stay_on_what_they_mark():
-    taken = views(TALL, WIDE)
+@pytest.mark.parametrize("first", [TALL, *ROUNDED])
+def test_marks_stay_on_what_they_mark(first):
+    taken = views(first, WIDE)
     place = np.array([[4.0, -7.0, 12.0]])
     marked = tuple(tuple(v.project(place)[0][0].tolist()) for v in taken)
     frame = own_frame(taken, "ab")

@@ -17,6 +17,7 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.errors import RefusedError, UsageError
 from gcar_deploy.output.step_folder import PATH_COUNT_MM, StepFolder
 from gcar_deploy.selftest import tiny_case
+from tests.hard.phantoms import GRID, carm, paths, straight
 
 OPTIONS = RunOptions(predict=PredictOptions(predictor="none"))
 VIEWS = [f"1-vessels-view{k}-{what}.png" for k in "12" for what in ("mask", "path", "skeleton")]
@@ -67,6 +68,18 @@ def test_pictures_are_what_was_found(kept):
         counts = cv2.imread(str(folder / f"{head}-path.png"), cv2.IMREAD_UNCHANGED)
         assert counts.dtype == np.uint16
         np.testing.assert_allclose(counts * PATH_COUNT_MM, view.path_mm, atol=PATH_COUNT_MM)
+
+
+def test_pictures_have_the_pixels_that_were_given(tmp_path):
+    """Found on square pixels, written on those of the picture."""
+    long = {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.49, 0.98), "sdd_mm": 1299.0}
+    views = [carm(-30, -20, **long), carm(45, 25, **long)]
+    pictures = paths(straight(radius=2.0), views)
+    result = Engine(options=OPTIONS).reconstruct(pictures, GRID, on_step=StepFolder(tmp_path / "s"))
+    for view in result.views:
+        for name in ("1-vessels-view{}-mask", "1-vessels-view{}-path", "2-pose-view{}-mask"):
+            file = tmp_path / "s" / f"{name.format(view.view_id)}.png"
+            assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape == (256, 128)
 
 
 def test_points_and_trees_are_those_of_the_stages(kept):

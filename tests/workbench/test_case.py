@@ -10,9 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from gcar_deploy.config import PredictOptions, RunOptions
+from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
 from gcar_deploy.inputs.order import load_order
 from gcar_deploy.workbench.desk import Desk
+from tests.hard.phantoms import GRID, carm, paths, straight
 
 
 @pytest.fixture
@@ -54,3 +57,14 @@ def test_a_request_gets_its_own_pictures_whatever_others_read_meanwhile(desk, mo
 
     monkeypatch.setattr(case, "_keep_pairs", other)
     assert len(case.angiograms()) == 2
+
+
+def test_what_was_found_is_shown_on_the_pixels_of_the_picture(desk):
+    case = desk.demo()
+    long = {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.49, 0.98), "sdd_mm": 1299.0}
+    pictures = paths(straight(radius=2.0), [carm(-30, -20, **long), carm(45, 25, **long)])
+    engine = Engine(options=RunOptions(predict=PredictOptions(predictor="none")))
+    result = engine.reconstruct(pictures, GRID, on_step=case.take_step)
+    for shown, view in zip(case.vessels, result.views, strict=True):
+        assert shown.carm.rows == 256 and shown.mask.shape == (256, 128)
+        np.testing.assert_array_equal(shown.mask, view.mask)
