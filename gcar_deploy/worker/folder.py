@@ -10,11 +10,12 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
+from gcar_deploy.config import DicomLimits
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import is_folder
 
-#: a picture or geometry file larger than this is not copied
-MAX_BYTES = 256 * 2**20
+#: a file larger than this is not copied: no reader takes one
+MAX_BYTES = DicomLimits.max_bytes
 
 
 class AllowedFolder:

@@ -27,8 +27,6 @@ Work = Callable[[Order, Callable[[str, float], None], Callable[[], bool]], tuple
 class QueueFullError(GcarError):
     """As many jobs wait as may."""
 
-    exit_code = 7
-
 
 @dataclasses.dataclass(eq=False)
 class Job:
@@ -215,7 +213,9 @@ class JobQueue:
         self._finish(job)
 
     def _finish(self, job: Job) -> None:
-        if job.state != DONE:
+        if job.state == DONE:
+            job.received.clean_inputs()
+        else:
             job.received.clean()
         job.finished.set()
         self._tell(job)

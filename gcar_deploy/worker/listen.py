@@ -17,6 +17,7 @@ from typing import Any
 
 from pynetdicom import AE, evt
 
+from gcar_deploy.config import DicomLimits
 from gcar_deploy.dicom.header import CLASSIC, ENHANCED, SYNTAXES
 from gcar_deploy.errors import GcarError, UsageError
 from gcar_deploy.geometry.fields import MOST_VIEWS
@@ -40,11 +41,13 @@ _SECONDS = 60
 class Study:
     """Runs of one study that have arrived: SOP instance UID to file.
 
-    ``told`` is how many there were when it was last said what the study waits for.
+    ``senders`` have not let go yet; ``told`` is how many runs there were when it was last said what
+    the study waits for.
     """
 
     scratch: Path
     runs: dict[str, Path] = dataclasses.field(default_factory=dict)
+    senders: set[Any] = dataclasses.field(default_factory=set)
     told: int = 0
 
 
@@ -68,7 +71,7 @@ class Listener:
         *,
         title: str,
         runs: int = 2,
-        most_mib: int = 512,
+        most_mib: int = DicomLimits.max_bytes >> 20,
         say: Callable[[str], None] | None = None,
     ) -> None:
         if not 2 <= runs <= MOST_VIEWS:
@@ -77,6 +80,7 @@ class Listener:
         self._title, self._wanted, self._most_bytes = title, runs, most_mib * 2**20
         self._say = say or _log.info
         self._studies: dict[str, Study] = {}
+        self._ordered: list[Job] = []
         self._lock = threading.Lock()
         self._server: Any = None
 
@@ -137,22 +141,37 @@ class Listener:
             found = self._studies[study]
             if instance not in found.runs and len(found.runs) >= MOST_VIEWS:
                 return OUT_OF_RESOURCES
-            path = found.runs.setdefault(instance, found.scratch / f"run{len(found.runs) + 1}.dcm")
-            path.write_bytes(data)
+            path = found.runs.get(instance) or found.scratch / f"run{len(found.runs) + 1}.dcm"
+            try:
+                # A run counts once it is whole; one that is sent again is kept until then.
+                half = path.with_suffix(".part")
+                half.write_bytes(data)
+                half.replace(path)
+            except OSError as error:
+                _log.error("study %s: a run cannot be written (%s)", study, error.strerror or error)
+                return OUT_OF_RESOURCES
+            found.runs[instance] = path
+            found.senders.add(event.assoc)
         self._say(f"study {study}: {path.stem} received, {len(data) >> 10} KiB")
         return SUCCESS
 
-    def _let_go(self, _: Any) -> None:
-        """Order every study that is complete; a sender is done, and no run is half there."""
+    def _let_go(self, event: Any) -> None:
+        """Order every study that is complete, once all who sent runs of it are done."""
         with self._lock:
-            ready = [uid for uid, s in self._studies.items() if len(s.runs) >= self._wanted]
+            for waiting in self._studies.values():
+                waiting.senders.discard(event.assoc)
+            ready = [
+                uid
+                for uid, s in self._studies.items()
+                if len(s.runs) >= self._wanted and not s.senders
+            ]
             studies = {uid: self._studies.pop(uid) for uid in ready}
             for uid, study in studies.items():
                 self._say(f"study {uid}: {len(study.runs)} runs, reconstruction begins")
                 self._order(uid, study)
             for uid, study in self._studies.items():
                 count = len(study.runs)
-                if count != study.told:
+                if count != study.told and not study.senders:
                     study.told = count
                     self._say(f"study {uid}: {count} of {self._wanted} runs; waits for more")
 
@@ -160,14 +179,17 @@ class Listener:
         order = Order(views=tuple(study.runs.values()), out=self._free(uid))
         received = Received(order, study.scratch)
         try:
-            self._queue.submit(received)
+            self._ordered.append(self._queue.submit(received))
         except GcarError as error:
             _log.error("study %s: %s", uid, error)
             received.clean()
 
     def _free(self, uid: str) -> Path:
+        """Return where no result lies, and where none that was ordered will."""
+        self._ordered = [job for job in self._ordered if job.open]
+        taken = {job.order.out for job in self._ordered}
         path, number = self._out / uid, 1
-        while path.exists():
+        while path in taken or path.exists():
             number += 1
             path = self._out / f"{uid}-{number}"
         return path

@@ -24,6 +24,7 @@ from waitress.task import ThreadedTaskDispatcher
 from werkzeug.exceptions import HTTPException
 
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.worker.jobs import QueueFullError
 
 _log = logging.getLogger(__name__)
 LOOPBACK = "127.0.0.1"
@@ -76,6 +77,10 @@ def guard(
 
 def tell_errors(app: Flask) -> None:
     """Answer every error with one line and the exit code of the command."""
+
+    @app.errorhandler(QueueFullError)
+    def of_queue(problem: QueueFullError) -> Response:
+        return error(str(problem), problem.exit_code, HTTPStatus.SERVICE_UNAVAILABLE)
 
     @app.errorhandler(GcarError)
     def of_gcar(problem: GcarError) -> Response:

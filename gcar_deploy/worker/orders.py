@@ -41,6 +41,16 @@ class Received:
         """Return the text of an error; its paths are those that the order gave."""
         return str(error) if self.folder is None else self.folder.inside(str(error))
 
+    def clean_inputs(self) -> None:
+        """Remove the private copies of what the order named; a result among them stays."""
+        out = self.order.out
+        if self.scratch is None or out is None or not self.private:
+            self.clean()
+            return
+        for path in self.scratch.iterdir():
+            if path != out and not path.is_dir():
+                path.unlink(missing_ok=True)
+
     def clean(self) -> None:
         """Remove the private folder."""
         if self.scratch is not None:

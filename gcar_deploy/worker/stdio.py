@@ -18,12 +18,14 @@ from gcar_deploy.errors import GcarError, GeometryError, UsageError
 from gcar_deploy.geometry.fields import quote, read_json
 from gcar_deploy.reconstruction import RESEARCH_USE
 from gcar_deploy.worker.folder import AllowedFolder
-from gcar_deploy.worker.jobs import DONE, Job, JobQueue
+from gcar_deploy.worker.jobs import DONE, Job, JobQueue, QueueFullError
 from gcar_deploy.worker.orders import receive
 
 #: characters of one message
 MOST_CHARACTERS = 4 * 2**20
 PARSE_ERROR, INVALID_REQUEST, UNKNOWN_METHOD, INVALID_PARAMS = -32700, -32600, -32601, -32602
+#: as many jobs wait as may: the same request can be sent again
+BUSY = -32000
 
 
 class LineServer:
@@ -104,6 +106,8 @@ class LineServer:
                 self._fail(ident, UNKNOWN_METHOD, f"unknown method {method[:80]!r}")
         except UsageError as error:
             self._fail(ident, INVALID_PARAMS, str(error))
+        except QueueFullError as error:
+            self._fail(ident, BUSY, str(error))
         except GcarError as error:
             self._fail(ident, error.exit_code, str(error))
         return True
@@ -123,7 +127,11 @@ class LineServer:
         with self._asking:
             used = ident in self._request_of.values()
             if not used:
-                self._request_of[self._queue.submit(received).id] = ident
+                try:
+                    self._request_of[self._queue.submit(received).id] = ident
+                except QueueFullError:
+                    received.clean()
+                    raise
         if used:
             # With the id it would be the answer to the request at work.
             received.clean()

@@ -109,6 +109,19 @@ def test_who_cannot_be_told_of_a_job_does_not_end_the_worker():
     assert [job.state for job in jobs] == ["done", "done"]
 
 
+@pytest.mark.parametrize("kept", [False, True])
+def test_copies_of_pictures_go_with_the_work(queue, tmp_path, kept):
+    scratch = new_scratch()
+    (scratch / "view1.png").write_bytes(b"1")
+    out = scratch / "result" if kept else tmp_path / "result"
+    if kept:
+        out.mkdir()
+    job = queue.submit(an_order(scratch=scratch, out=out))
+    assert job.finished.wait(30) and job.state == "done"
+    assert scratch.exists() is kept
+    assert [path.name for path in scratch.glob("*")] == ["result"] * kept
+
+
 def test_old_jobs_are_forgotten_with_their_files(queue):
     jobs = []
     for _ in range(5):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import os
 import re
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -108,6 +111,73 @@ def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, sai
     assert told == [
         "run1 received", "1 of 2 runs; waits for more", "run2 received", "2 runs",
     ]  # fmt: skip
+
+
+def test_a_study_waits_for_its_own_sender(listening, runs):
+    port, orders, _, queue = listening
+    data = [pydicom.dcmread(file) for file in runs[1]]
+    data.append(pydicom.dcmread(runs[1][0]))
+    data[2].SOPInstanceUID = generate_uid()
+    link, other = associate(port), associate(port)
+    for one in data[:2]:
+        assert link.send_c_store(one).Status == 0
+    assert other.send_c_echo().Status == 0
+    other.release()
+    # Its end is handled after its release was answered.
+    time.sleep(0.5)
+    assert link.send_c_store(data[2]).Status == 0 and orders == []
+    link.release()
+    wait_for(queue, 1)
+    assert [len(views) for _, views in orders] == [3]
+
+
+def test_two_orders_of_a_study_at_work_have_a_folder_each(runs, tmp_path):
+    study, files = runs
+    at_work, outs = threading.Event(), []
+
+    def work(order, on_progress, cancel):
+        at_work.wait(60)
+        outs.append(order.out)
+        return {"status": "ok"}, order.out
+
+    queue = JobQueue(work)
+    listener = Listener(queue, tmp_path, title="GCAR")
+    port = listener.start(0)
+    for _ in range(2):
+        link = associate(port)
+        for file in files:
+            assert link.send_c_store(pydicom.dcmread(file)).Status == 0
+        link.release()
+    end = time.monotonic() + 60
+    while sum(queue.counts().values()) < 2:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    at_work.set()
+    wait_for(queue, 2)
+    listener.stop()
+    queue.close()
+    assert outs == [tmp_path / study, tmp_path / f"{study}-2"]
+
+
+def test_a_run_that_could_not_be_written_is_none(listening, runs, monkeypatch):
+    port, orders, _, queue = listening
+    first, second = (pydicom.dcmread(file) for file in runs[1])
+    link = associate(port)
+    assert link.send_c_store(first).Status == 0
+
+    def full(self, data):
+        self.touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", full)
+        for one in (first, second):
+            assert link.send_c_store(one).Status == 0xA700
+    assert link.send_c_store(second).Status == 0
+    link.release()
+    wait_for(queue, 1)
+    assert [len(views) for _, views in orders] == [2]
+    assert all(orders[0][1])
 
 
 @pytest.mark.filterwarnings("ignore:Invalid value for VR UI")

@@ -6,8 +6,10 @@ import io
 import json
 import os
 import queue
+import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 
 import pytest
@@ -235,3 +237,33 @@ def test_a_job_that_needs_too_much_memory_fails_alone(good_case, tmp_path):
     assert "out of memory" in answers[0]["error"]["message"] and answers[0]["error"]["code"] == 1
     assert answers[1]["result"]["result"]["status"] in ("ok", "degraded")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out1"]
+
+
+def test_a_full_queue_is_said_and_keeps_no_copies(
+    make_queue, case_folder, tmp_path, gate, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "private"))
+    (tmp_path / "private").mkdir()
+    folder = tmp_path / "folder"
+    shutil.copytree(case_folder, folder)
+    gate.clear()
+    host = Host(
+        lambda on_change: make_queue(on_change=on_change, most_waiting=1), AllowedFolder(folder)
+    )
+    names = {"views": ["view1.png", "view2.png"], "geometry": "geom.json"}
+    host.send(0, "reconstruct", **names, out="out0")
+    jobs, asked = {}, 0
+    while jobs.get("running") != 1:
+        asked += 1
+        host.send(f"health {asked}", "health")
+        jobs = host.answer(f"health {asked}")["result"]["jobs"]
+    for number in range(1, 6):
+        host.send(number, "reconstruct", **names, out=f"out{number}")
+    refused = [host.answer(number)["error"] for number in range(2, 6)]
+    assert {error["code"] for error in refused} == {-32000}
+    assert "try again" in refused[-1]["message"]
+    assert len(list((tmp_path / "private").iterdir())) == 2
+    gate.set()
+    assert "result" in host.answer(0) and "result" in host.answer(1)
+    host.end()
+    assert not list((tmp_path / "private").iterdir())
