@@ -137,8 +137,7 @@ def volume_coverage(carm: CArm, grid: Grid) -> float:
     axes = [(np.arange(16) + 0.5) / 16 * n - 0.5 for n in grid.shape]
     index = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     pixels, depth = carm.project(grid.index2world(index))
-    inside = (pixels > -0.5).all(axis=1) & (pixels[:, 0] < carm.columns - 0.5)
-    return float((inside & (pixels[:, 1] < carm.rows - 0.5) & (depth > 0)).mean())
+    return float((carm.shows(pixels) & (depth > 0)).mean())
 
 
 def _registered(

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import RunOptions
-from gcar_deploy.errors import CancelledError
+from gcar_deploy.errors import CancelledError, NumericalError, RefusedError
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
@@ -62,6 +62,9 @@ class SecondLook:
         most = self.options.quality.good_second_look
         try:
             share = self.elsewhere(tree)
+        except (NumericalError, RefusedError) as error:
+            # The tree that was asked about is there, and stays.
+            return f"a second look came to nothing ({error}): branches may lie elsewhere"
         except CancelledError:
             if self.watch.cancelled:
                 raise

@@ -75,6 +75,7 @@ def test_no_work_goes_on_after_a_reconstruction_that_failed(monkeypatch):
     assert events == ["voxels"]
 
 
+@pytest.mark.req("REQ-33")
 @pytest.mark.slow
 def test_a_reconstruction_is_the_same_on_one_thread_and_on_three():
     case = demo_case()

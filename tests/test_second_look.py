@@ -7,7 +7,7 @@ import pytest
 
 from gcar_deploy import CArm, Engine
 from gcar_deploy.config import RunOptions
-from gcar_deploy.errors import CancelledError
+from gcar_deploy.errors import CancelledError, NumericalError, RefusedError
 from gcar_deploy.reconstruct import STAGES
 from gcar_deploy.second_look import SecondLook, about_z, carm_turned
 from gcar_deploy.selftest import tiny_case
@@ -78,6 +78,16 @@ def test_without_time_it_is_said_that_nobody_looked_and_cancelled_is_cancelled(m
     ).doubt(tree)
     with pytest.raises(CancelledError):
         SecondLook(*how, Stopwatch(STAGES, cancel=lambda: True)).doubt(tree)
+
+
+@pytest.mark.parametrize("error", [NumericalError("not finite"), RefusedError("no candidates")])
+def test_a_second_look_that_fails_leaves_the_tree(made, monkeypatch, error):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr("gcar_deploy.second_look.find_centers", fails)
+    said = SecondLook(*made[1], Stopwatch(STAGES)).doubt(made[0])
+    assert str(error) in said and "may lie elsewhere" in said
 
 
 @pytest.mark.slow

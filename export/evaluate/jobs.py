@@ -146,7 +146,7 @@ def dataset(label: Path) -> str:
 
 
 def measure(case: Case, solved: Solved) -> dict[str, Measure]:
-    """All measures of one solved case, by the names of ``evaluation_tables.MEASURES``.
+    """All measures of one solved case, by the names of ``tables.MEASURES``.
 
     New projections are cast from the returned volume, clipped to 0 .. 1, and averaged over
     the case's new views (those on which the measure is defined). Where the patient moved between

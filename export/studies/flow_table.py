@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError
-from gcar_deploy.flow import Assumption, PressureDrop, model_0d, pressure_drop
+from gcar_deploy.flow import Assumption, PressureDrop, pressure_drop
 from gcar_deploy.measure import Sections
 from gcar_deploy.measure.lesions import LESION_SHARE
 from gcar_deploy.measure.lumen import tree_lumens
@@ -186,26 +186,6 @@ def fitted(errors: Sequence[DiameterError]) -> tuple[float, float, float]:
     best = minimize(cost, np.log([0.05, 1.0]), method="Nelder-Mead")
     floor, factor = np.exp(best.x).tolist()
     return floor, factor, lost
-
-
-def solver_gap(tree: Tree, drop: PressureDrop) -> float:
-    """Largest relative difference of flow or pressure from svZeroDSolver's, over all branches."""
-    import svzerod
-
-    found = svzerod.simulate(model_0d(tree, drop))
-    last = found[found["time"] == found["time"].max()].set_index("name")
-    gaps = []
-    for k in drop.network.order:
-        vessel = drop.vessels[k]
-        names = [name for name in last.index if name.startswith(f"branch{k + 1}_seg")]
-        pressure = 10 * drop.assumed.aortic_pressure_pa * vessel.ratio
-        for ours, theirs in (
-            (pressure[0], last.loc[names[0], "pressure_in"]),
-            (pressure[-1], last.loc[names[-1], "pressure_out"]),
-            (vessel.flow_m3_s * 1e6, last.loc[names[0], "flow_in"]),
-        ):
-            gaps.append(abs(ours / theirs - 1))
-    return float(max(gaps))
 
 
 def table(rows: Sequence[FlowRow]) -> str:

@@ -23,8 +23,8 @@ from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.types import Image
 from gcar_export.scenes.cine import CinePair, CineRun, cine_pair
 
-#: patients that options were chosen on, and those that are reported
-CHOSEN_ON, REPORTED = 900, 7_300
+#: patients that options were chosen on
+CHOSEN_ON = 900
 #: frames that a pair may be apart
 WITHIN_FRAMES = 1.0
 

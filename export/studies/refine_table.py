@@ -39,7 +39,6 @@ from gcar_export.scenes.protocols import Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
 from gcar_export.scenes.whole_file import whole_file
 
-NOISES = (0.0, 0.5, 1.0, 2.0)
 DROPPED = 0.1
 #: rows of the table: refiner, and whether the loss has its centreline part
 MODES: tuple[tuple[RefinerName, bool], ...] = (

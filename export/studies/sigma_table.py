@@ -48,7 +48,6 @@ from gcar_export.scenes.trees import random_tree
 GHOST_MM = 5.0
 #: squared length that 95 % of a standard Gaussian in two dimensions stay within, per axis
 CHI95 = 5.991 / 2
-CONDITIONS = ("clean", "degraded", "mask", "raw")
 #: what the covariance is made of, part after part; the last is what a result states
 PARTS = ("fit alone", "fit, geometry")
 #: how well the centreline of a label volume is known, standard deviation per axis in voxels

@@ -10,38 +10,35 @@ import click
 
 from gcar_deploy.cli.common import Talk, gathered, say, talk_options
 from gcar_deploy.cli.paths import ANY_PATH
+from gcar_deploy.errors import UsageError
 
 if TYPE_CHECKING:
     from gcar_deploy.flow import Assumption
 
-_VELOCITY_M_S, _AORTIC_MMHG = 0.35, 90.0
 
-
-def _assumption(
-    velocity: float, flow: float | None, flow_sigma: float | None, aortic_pressure: float
-) -> Assumption:
+def _assumption(**given: Any) -> Assumption:
     from gcar_deploy.flow import Assumption
 
-    return Assumption(
-        velocity_m_s=velocity, flow_ml_min=flow, flow_sigma=flow_sigma,
-        aortic_pressure_mmhg=aortic_pressure,
-    )  # fmt: skip
+    if given["velocity_m_s"] is not None and given["flow_ml_min"] is not None:
+        raise UsageError("--velocity and --flow both say how much flows: give one of them")
+    return Assumption(**{name: value for name, value in given.items() if value is not None})
 
 
 _ASSUMED = {
-    "aortic_pressure": click.option(
-        "--aortic-pressure", type=float, default=_AORTIC_MMHG, show_default=True, metavar="MMHG",
-        help="Mean pressure Pa at the inlet.",
+    "aortic_pressure_mmhg": click.option(
+        "--aortic-pressure", "aortic_pressure_mmhg", type=float, metavar="MMHG",
+        show_default="90", help="Mean pressure Pa at the inlet.",
     ),
     "flow_sigma": click.option(
         "--flow-sigma", type=float, metavar="SHARE",
         help="Relative standard deviation of the flow; 0.2 with a velocity, 0 with --flow.",
     ),
-    "flow": click.option(
-        "--flow", type=float, metavar="ML/MIN", help="Flow through the inlet, if it is known."
+    "flow_ml_min": click.option(
+        "--flow", "flow_ml_min", type=float, metavar="ML/MIN",
+        help="Flow through the inlet, if it is known.",
     ),
-    "velocity": click.option(
-        "--velocity", type=float, default=_VELOCITY_M_S, show_default=True, metavar="M/S",
+    "velocity_m_s": click.option(
+        "--velocity", "velocity_m_s", type=float, metavar="M/S", show_default="0.35",
         help="Mean velocity at the inlet in hyperaemia.",
     ),
 }  # fmt: skip

@@ -29,8 +29,10 @@ def validate(order: Order, talk: Talk) -> None:
       gcar validate view1.png view2.png --geom geom.json
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.config import RunOptions
+    from gcar_deploy.inputs.order import check_view_numbers
     from gcar_deploy.inspection import inspect_files
 
+    check_view_numbers(order)
     options = order.options(RunOptions())
     found = inspect_files(order.views, order.geometry, options, order.masks, order.drawn)
     click.echo(json.dumps(found.to_dict()) if talk.as_json else "\n".join(_lines(found)))

@@ -18,7 +18,7 @@ from gcar_deploy.flow.pressure import PressureDrop
 from gcar_deploy.tree.tree import Branch, Tree
 
 #: 1 Pa s / m^3 in dyn s / cm^5, 1 Pa s^2 / m^6 in dyn s^2 / cm^8, 1 Pa in dyn / cm^2
-_R_CGS, _S_CGS, _P_CGS = 1e-5, 1e-11, 10.0
+_R_CGS, _S_CGS = 1e-5, 1e-11
 _ML_S = 1e6
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from gcar_deploy.errors import GeometryError
 from gcar_deploy.geometry.matrix import ReadOff, applied, axes, checked, read_off
-from gcar_deploy.types import Array, Pixels, Points, Scalars
+from gcar_deploy.types import Array, Mask, Pixels, Points, Scalars
 
 #: key -> (lowest, highest, unit) of what is accepted at all.
 HARD_RANGES: dict[str, tuple[float, float, str]] = {
@@ -263,6 +263,12 @@ class CArm:
     def pixel_at_isocenter_mm(self) -> float:
         """Geometric mean of the pixel's two sides, scaled back to the isocentre, mm."""
         return math.sqrt(self.pixel_spacing_mm[0] * self.pixel_spacing_mm[1]) / self.magnification
+
+    def shows(self, pixels: Pixels) -> Mask:
+        """(n,) whether (n, 2) pixels (col, row) lie in the picture: their centres are whole."""
+        low, high = np.array([-0.5, -0.5]), np.array([self.columns - 0.5, self.rows - 0.5])
+        inside: Mask = np.all((pixels >= low) & (pixels < high), axis=1)
+        return inside
 
     def px_per_mm(self, depth_mm: Scalars) -> Scalars:
         """Pixels to a mm across the ray at depths of any shape, geometric mean of both axes."""

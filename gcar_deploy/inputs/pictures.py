@@ -91,7 +91,8 @@ def prepare(
     angiograms = with_masks(angiograms, masks, options.imaging.limits)
     notes += [f"view {k}: the vessel mask is the user's" for k in masks]
     for k, lines in (drawn or {}).items():
-        angiograms[_index(k, "edits", angiograms)] = with_drawn(angiograms[k - 1], lines)
+        place = _index(k, "edits", angiograms)
+        angiograms[place] = with_drawn(angiograms[place], lines)
         notes += [f"view {k}: {text}" for text in _said(lines, angiograms[k - 1].pixels.shape)]
     return angiograms, grid, notes
 

@@ -4,7 +4,7 @@ A model is a program: its graph may loop, draw random numbers, call operators of
 or name files elsewhere on the disk. Here the file's own structure (protocol buffers, as laid
 down in ``onnx.proto``) is walked byte by byte, and everything that a feed-forward network of
 this project does not need is refused. Nothing is built or run; how large the graph's constants
-become is reckoned in ``onnx_constants``. Functions raise ``ValueError`` with the end of a
+become is reckoned in ``constants``. Functions raise ``ValueError`` with the end of a
 sentence; ``read_model`` puts the name of the file in front.
 """
 

@@ -40,7 +40,7 @@ def landmark_pixels(landmarks: Sequence[Landmark], carms: Sequence[CArm]) -> Arr
         for k, (point, carm) in enumerate(zip(landmark, carms, strict=True)):
             if point is None:
                 continue
-            if not (0 <= point[0] < carm.columns and 0 <= point[1] < carm.rows):
+            if not carm.shows(np.array([point])).all():
                 raise UsageError(
                     f"landmark {m + 1}: ({point[0]:g}, {point[1]:g}) is outside the "
                     f"{carm.columns} x {carm.rows} pixels (columns x rows) of view {k + 1}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import html.parser
 import json
 import multiprocessing
@@ -113,9 +114,8 @@ def test_an_interrupted_batch_goes_on(table, tmp_path, monkeypatch):
 def test_a_changed_case_is_not_passed_off_as_the_old_one(table, tmp_path, monkeypatch):
     rows_without_processes(monkeypatch)
     cases = [case for case in read_cases(table) if case.name in ("twice", "bad-geometry")]
-    run_batch(cases, tmp_path / "out", ENGINE)
-    with pytest.raises(UsageError, match=r"'twice'.*--force"):
-        run_batch(cases, tmp_path / "out", EngineChoice(threads=2))
+    rows = run_batch(cases, tmp_path / "out", ENGINE)
+    assert run_batch(cases, tmp_path / "out", EngineChoice(threads=2)) == rows
     unrefined = read_cases(table, Order(predictor="none", refiner="none"))
     with pytest.raises(UsageError, match=r"'twice'.*--force"):
         run_batch([c for c in unrefined if c.name == "twice"], tmp_path / "out", ENGINE)
@@ -145,6 +145,17 @@ def folder_case(tmp_path):
     path = tmp_path / "folder.csv"
     path.write_text("case,geom,view1,view2\na,g.json,frames,b.png\n")
     return read_cases(path)[0], folder
+
+
+def test_only_what_changes_a_result_is_in_the_fingerprint(tmp_path):
+    case, _ = folder_case(tmp_path)
+    models = [tmp_path / name for name in ("a.onnx", "b.onnx")]
+    for file in models:
+        file.write_bytes(b"weights")
+    a, b = (dataclasses.replace(ENGINE, model=file, threads=n) for n, file in enumerate(models, 1))
+    assert case.fingerprint(a) == case.fingerprint(b) != case.fingerprint(ENGINE)
+    models[1].write_bytes(b"others")
+    assert case.fingerprint(a) != case.fingerprint(b)
 
 
 def test_a_frame_that_changed_in_a_folder_is_noticed(tmp_path):

@@ -55,6 +55,11 @@ def test_values_out_of_range(copy, option, value, says):
     assert done.code == 2 and says in done.err and done.err.count("\n") == 1
 
 
+def test_flow_and_velocity_together_are_refused(copy):
+    done = gcar("flow", copy, "--flow", "200", "--velocity", "0.9")
+    assert done.code == 2 and "--velocity and --flow" in done.err
+
+
 def test_a_folder_of_a_version_before_has_radii_alone(copy):
     told = json.loads((copy / "result.json").read_text())
     del told["files"]["diameters.csv"]

@@ -32,6 +32,22 @@ def result_of(folder):
 
 
 @pytest.mark.slow
+def test_edits_of_a_view_that_is_not_there_are_told(good_case, tmp_path):
+    order = {
+        "views": [str(good_case / f"view{k}.png") for k in (1, 2)],
+        "geometry": str(good_case / "geom.json"),
+        "edits": {"3": [{"do": "erase", "width_px": 9, "points": [[1, 2], [3, 4]]}]},
+    }
+    file = tmp_path / "o.json"
+    file.write_text(json.dumps(order))
+    for verb in (("validate",), ("run", "--out", tmp_path / "out")):
+        done = gcar(*verb, "--order", file)
+        assert done.code == 2 and "edits 3: there are views 1 .. 2" in done.err
+    pictures = [good_case / "view1.png", good_case / "view2.png"]
+    done = gcar("validate", *pictures, "--order", file)
+    assert done.code == 2 and "edits 3" in done.err
+
+
 def test_a_printed_order_repeats_the_run(good_case, tmp_path):
     told = ("--landmark", "48,48:48,48", "--refiner", "none", "--pose", "auto", "--glb")
     asked = gcar(*arguments(good_case, tmp_path / "a", *told, "--print-order"))

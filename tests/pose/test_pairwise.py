@@ -156,6 +156,13 @@ def test_landmarks_are_checked():
     ):
         with pytest.raises(UsageError, match=words):
             landmark_pixels([wrong], TOLD)
+    # The first pixel reaches half of one before its middle, the last half of one behind.
+    columns, rows = TOLD[0].columns, TOLD[0].rows
+    for inside in ((-0.4, -0.4), (columns - 0.6, rows - 0.6)):
+        landmark_pixels([(inside, (1.0, 1.0))], TOLD)
+    for beyond in ((-0.6, 1.0), (1.0, -0.6), (columns - 0.4, 1.0), (1.0, rows - 0.4)):
+        with pytest.raises(UsageError, match="outside"):
+            landmark_pixels([(beyond, (1.0, 1.0))], TOLD)
 
 
 def test_blank_picture_and_switched_off():
