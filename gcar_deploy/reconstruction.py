@@ -24,6 +24,7 @@ from gcar_deploy.geometry.observability import (
     silent_errors,
 )
 from gcar_deploy.geometry.own_frame import OwnFrame
+from gcar_deploy.geometry.scene import told_view
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.own_frame import found_as_given
 from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured
@@ -342,8 +343,10 @@ class Reconstruction:
                 "bit_depth": angiogram.bit_depth,
                 "rows": angiogram.carm.rows,
                 "columns": angiogram.carm.columns,
+                **({"mask_sha256": angiogram.mask_sha256} if angiogram.mask_sha256 else {}),
                 **({} if angiogram.frame is None else {"frame": angiogram.frame.to_dict()}),
             },
+            "geometry": told_view(angiogram.carm, angiogram.intensity),
             "kind": self.views[k].kind,
             "calibrated": self.views[k].calibrated,
             "coverage": judged.coverage,

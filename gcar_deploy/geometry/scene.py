@@ -149,21 +149,10 @@ def parse_scene(text: str, name: str = "geom.json") -> Scene:
 
 def scene_to_json(scene: Scene) -> str:
     """Return the scene as the text of a ``geom.json`` that parses to the same scene."""
-    views = []
-    for view in scene.views:
-        c = view.carm
-        entry: dict[str, Any] = {"id": view.id}
-        for key in (*_VIEW_NUMBERS, "detector_rotation_deg", "rows", "columns"):
-            entry[key] = getattr(c, key)
-        entry["pixel_spacing_mm"] = list(c.pixel_spacing_mm)
-        entry["principal_point_px"] = (
-            None if c.principal_point_px is None else list(c.principal_point_px)
-        )
-        entry["isocenter_offset_mm"] = list(c.isocenter_offset_mm)
-        matrix = c.projection_matrix
-        entry["projection_matrix"] = None if matrix is None else [list(row) for row in matrix]
-        entry["intensity"] = dataclasses.asdict(view.intensity)
-        views.append(entry)
+    views = [
+        {"id": view.id, **_values(view.carm), "intensity": dataclasses.asdict(view.intensity)}
+        for view in scene.views
+    ]
     data: dict[str, Any] = {"schema": SCHEMA, "frame": "LPS", "views": views}
     if scene.grid is not None:
         g = scene.grid
@@ -173,6 +162,27 @@ def scene_to_json(scene: Scene) -> str:
             "shape": list(g.shape),
         }
     return json.dumps(data, indent=1) + "\n"
+
+
+def told_view(carm: CArm, intensity: Intensity) -> dict[str, Any]:
+    """Return a view as ``geom.json`` tells it but for its id, without what is left open."""
+    everything = {**_values(carm), "intensity": dataclasses.asdict(intensity)}
+    everything["intensity"] = {k: v for k, v in everything["intensity"].items() if v is not None}
+    return {key: value for key, value in everything.items() if value is not None}
+
+
+def _values(carm: CArm) -> dict[str, Any]:
+    point, matrix = carm.principal_point_px, carm.projection_matrix
+    return {
+        **{key: getattr(carm, key) for key in _VIEW_NUMBERS},
+        "detector_rotation_deg": carm.detector_rotation_deg,
+        "rows": carm.rows,
+        "columns": carm.columns,
+        "pixel_spacing_mm": list(carm.pixel_spacing_mm),
+        "principal_point_px": None if point is None else list(point),
+        "isocenter_offset_mm": list(carm.isocenter_offset_mm),
+        "projection_matrix": None if matrix is None else [list(row) for row in matrix],
+    }
 
 
 def match_picture(

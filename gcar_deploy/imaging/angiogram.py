@@ -48,6 +48,8 @@ class Angiogram:
         Where the file itself says that there is a picture (shutters); None for everywhere.
     mask : (rows, cols) bool or None
         Vessel as the user says; it wins over anything found in the pixels.
+    mask_sha256 : str
+        Of the bytes of the mask's file; empty without one.
     erased, painted : (rows, cols) bool or None
         What the user takes from, and adds to, the vessels that are found.
     frame : ChosenFrame or None
@@ -74,6 +76,7 @@ class Angiogram:
     bare: tuple[Image, ...] = ()
     file: str = ""
     enlarged: float = 1.0
+    mask_sha256: str = ""
 
     def __post_init__(self) -> None:
         _check_shape(self.view_id, self.carm, self.pixels)

@@ -191,8 +191,9 @@ def with_masks(
             array = _unmasked(f"mask {number}", given)
             if array.dtype.kind not in "biuf":
                 raise ImageError(f"mask {number} holds {array.dtype}; give numbers or booleans")
+            sha256 = _digest(array)
         else:
-            array = read_picture(given, limits, binary=True)[0]
+            array, _, sha256 = read_picture(given, limits, binary=True)
         shape = out[place].pixels.shape
         if array.shape != shape:
             raise ImageError(
@@ -204,7 +205,7 @@ def with_masks(
                 f"mask {number} marks {mask.mean():.0%} of the picture as vessel "
                 f"(at most {MOST_VESSEL:.0%} can be)"
             )
-        out[place] = dataclasses.replace(out[place], mask=mask)
+        out[place] = dataclasses.replace(out[place], mask=mask, mask_sha256=sha256)
     return out
 
 
@@ -356,9 +357,14 @@ def _from_array(
         raise ImageError(
             f"view {view_id}: grey values must be finite in single precision and not negative"
         )
-    sha256 = hashlib.sha256(f"{given.dtype.name}{given.shape}".encode())
-    sha256.update(np.ascontiguousarray(given).tobytes())
-    return pixels, depth, sha256.hexdigest()
+    return pixels, depth, _digest(given)
+
+
+def _digest(array: np.ndarray) -> str:
+    """SHA-256 of an array's numbers, type and shape."""
+    sha256 = hashlib.sha256(f"{array.dtype.name}{array.shape}".encode())
+    sha256.update(np.ascontiguousarray(array).tobytes())
+    return sha256.hexdigest()
 
 
 def _unmasked(name: str, array: np.ndarray) -> np.ndarray:

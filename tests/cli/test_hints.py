@@ -1,11 +1,13 @@
 """What a person tells: landmarks, pose, masks; and what comes back of it."""
 
+import hashlib
 import json
 
 import cv2
 import numpy as np
 import pytest
 
+from gcar_deploy.geometry.scene import load_scene, parse_scene
 from gcar_deploy.selftest import tiny_case
 from tests.cli.conftest import gcar
 
@@ -54,6 +56,20 @@ def test_pose_off_estimates_nothing(good_case, tmp_path):
     view = json.loads(done.out)["views"][1]
     assert view["estimated_offset_mm"] == [0, 0, 0]
     assert view["disagreement_after"] == view["disagreement_before"]
+
+
+def test_a_result_says_which_geometry_and_masks_it_is_of(good_case, tmp_path):
+    mask = tmp_path / "mine.png"
+    grey = cv2.imread(str(good_case / "view1.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(mask), np.uint8(255 * (grey > 0)))
+    done = run(good_case, tmp_path / "r", "--mask", f"1:{mask}", "--json")
+    first, second = json.loads(done.out)["views"]
+    assert first["picture"]["mask_sha256"] == hashlib.sha256(mask.read_bytes()).hexdigest()
+    assert "mask_sha256" not in second["picture"]
+    scene = {"schema": "gcar-geometry/1", "frame": "LPS",
+             "views": [{"id": v["id"], **v["geometry"]} for v in (first, second)]}  # fmt: skip
+    given = load_scene(good_case / "geom.json")
+    assert parse_scene(json.dumps(scene)).views == given.views
 
 
 @pytest.mark.slow
