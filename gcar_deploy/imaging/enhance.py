@@ -62,7 +62,7 @@ def absorbance(pixels: Image) -> Image:
 
 
 def searched(pictures: Mapping[str, Image]) -> Image:
-    """Return the one of ``extract.bright_vessels`` to look for vessels in: the first, or named."""
+    """Return the one of ``bright_vessels`` to look for vessels in: the first, or named."""
     return pictures.get("search", next(iter(pictures.values())))
 
 

@@ -17,16 +17,16 @@ from gcar_deploy.imaging import skeleton as skel
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
 from gcar_deploy.imaging.border import cut_out, put_back, shown_box
 from gcar_deploy.imaging.coarse import as_fine, coarser
-from gcar_deploy.imaging.collimator import collimator
 from gcar_deploy.imaging.edits import edited
 from gcar_deploy.imaging.full_mask import refuse_full
 from gcar_deploy.imaging.fusion import fused, without_device
+from gcar_deploy.imaging.grey_values import bright_vessels
 from gcar_deploy.imaging.learned import Found, learned_vessels
 from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.imaging.polarity import is_dark, with_polarity
-from gcar_deploy.imaging.shadow_devices import without_devices
+from gcar_deploy.imaging.shadow_devices import comes_from_outside, without_devices
 from gcar_deploy.imaging.standing import what_came, without_standing
 from gcar_deploy.imaging.thin_mask import refuse_thin
 from gcar_deploy.imaging.widths import MASK_ERROR
@@ -48,8 +48,6 @@ MIN_LENGTH_MM, EVEN_LENGTH_MM = 25.0, 10.0
 MIN_CONTRAST, NET_MIN_CONTRAST = 6.0, 3.0
 #: and the peak, as a share of the white level, must be seen at all
 MIN_PEAK = 0.03
-#: grey values are no darker than this share of the white level: half a step of 16 bits
-BLACK = 2.0**-17
 #: vessels never fill more than this share of a picture
 _FULL = 0.9
 
@@ -109,7 +107,8 @@ def _found(
     for box in dict.fromkeys(((0, pixels.shape[0], 0, pixels.shape[1]), shown_box(pixels))):
         part = cut_out(angiogram, box)
         grey = _grey_values(part)
-        drawn = even_ground.shadow(grey[0]["linear"], grey[1])
+        pixel_mm = part.carm.pixel_at_isocenter_mm
+        drawn = even_ground.shadow(grey[0]["linear"], grey[1], pixel_mm)
         if drawn is not None:
             view = _from_shadow(part, grey, drawn, options, segmenter)
             return put_back(view, angiogram, box)
@@ -175,6 +174,9 @@ def _from_shadow(
         view = _from_drawn(seen, drawn.mask, EVEN_LENGTH_MM)
     else:
         view = _from_grey(seen, grey, None, EVEN_LENGTH_MM)
+    pixel_mm = angiogram.carm.pixel_at_isocenter_mm
+    if not comes_from_outside(drawn.mask, grey[1], pixel_mm):
+        return view
     with contextlib.suppress(RefusedError):
         filtered, *_ = _lines(angiogram, grey, None)
         view = without_device(view, filtered.catheter, filtered.catheter_mm)
@@ -388,33 +390,3 @@ def _contrast_path(
     if estimate.mm_per_unit <= 0:
         raise _nothing(angiogram, "the lines found have no contrast")
     return estimate.path_mm
-
-
-def bright_vessels(pixels: Image, kind: str, dark: bool) -> tuple[dict[str, Image], Mask]:
-    """Pictures in which vessels are bright and paths add up, one per grey-value law.
-
-    Returns
-    -------
-    pictures : name -> (rows, cols) float32
-        ``search`` (where given) is the one to look for vessels in; the others are linear in
-        the path if their law holds: ``linear`` (logarithm taken), ``log`` (Beer's law), and
-        ``display``, a compromise that is nowhere far off.
-    holes : (rows, cols) bool, collimator
-    """
-    white = max(float(np.percentile(pixels, 99.5)), 1e-12)
-    level = pixels / np.float32(white)
-    if kind == "attenuation":
-        level = -level if dark else level
-        return {"linear": level, "display": level}, np.zeros(pixels.shape, bool)
-    if not dark:  # a negative: turn it back, so that Beer's law can be tried on it
-        level = float(level.max()) - level
-    holes = collimator(pixels, negative=not dark)
-    # Half of the darkest grey value that is one: black stays finite, whatever a count is.
-    darkest = float(np.min(level, where=level > 0, initial=np.inf))
-    floor = np.float32(min(max(0.5 * darkest, BLACK), 1.0))
-    return {
-        "search": enhance.absorbance(level),
-        "display": -np.log(np.clip(level, 0, None) + np.float32(enhance.DISPLAY_OFFSET)),
-        "linear": -level,
-        "log": -np.log(np.maximum(level, floor)),
-    }, holes

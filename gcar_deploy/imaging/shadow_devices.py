@@ -15,11 +15,23 @@ from gcar_deploy.imaging.angiogram import VesselImage
 from gcar_deploy.imaging.border import inward_px
 from gcar_deploy.imaging.catheter import BORDER_MM
 from gcar_deploy.imaging.device_lines import device_map
+from gcar_deploy.imaging.even_ground import TOUCHING_PX
 from gcar_deploy.imaging.fusion import without_lines
 from gcar_deploy.imaging.learned import devices
 from gcar_deploy.imaging.net import Segmenter, at_network_size, net_input
 from gcar_deploy.imaging.resample import resize
 from gcar_deploy.types import Image, Mask
+
+
+def comes_from_outside(shadow: Mask, holes: Mask, pixel_mm: float) -> bool:
+    """Whether something on an even ground reaches the end of the picture, as catheters do.
+
+    It does so to the last pixel; where a picture fades into holes, to near them.
+    """
+    own = inward_px(np.ones_like(holes))
+    left = inward_px(~holes)
+    reaches = (own <= TOUCHING_PX) | ((left < own) & (left * pixel_mm <= BORDER_MM))
+    return bool((shadow & reaches).any())
 
 
 def without_devices(
@@ -44,9 +56,9 @@ def without_devices(
     ModelError, NumericalError, CancelledError
         As ``Segmenter.look``.
     """
-    pixel_mm = view.carm.pixel_at_isocenter_mm
-    if not (view.mask & (inward_px(~holes) * pixel_mm <= BORDER_MM)).any():
+    if not comes_from_outside(view.mask, holes, view.carm.pixel_at_isocenter_mm):
         return view
+    pixel_mm = view.carm.pixel_at_isocenter_mm
     work, work_holes = at_network_size(search, holes)
     size = work.shape[::-1]
     line = skel.skeletonize(resize(view.skeleton.astype(np.float32), size) > 0)

@@ -123,6 +123,15 @@ def strong_parts(skeleton: Mask, strength: Image, share: float) -> Mask:
     return keep[label]
 
 
+def parts_of_length(skeleton: Mask, least_px: float) -> Mask:
+    """Keep connected parts whose line is at least so long, pixels."""
+    n, label = cv2.connectedComponents(skeleton.astype(np.uint8), connectivity=8)
+    length = arc_length(skeleton)
+    keep = np.bincount(label[skeleton], weights=length[skeleton], minlength=n) >= least_px
+    keep[0] = False
+    return keep[label]
+
+
 def parts_touching(mask: Mask, seeds: Mask) -> Mask:
     """Keep the connected parts of ``mask`` that hold at least one seed."""
     n, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)

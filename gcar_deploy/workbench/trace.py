@@ -11,7 +11,7 @@ from skimage.graph import route_through_array
 from gcar_deploy.errors import UsageError
 from gcar_deploy.imaging import enhance
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.extract import bright_vessels
+from gcar_deploy.imaging.grey_values import bright_vessels
 from gcar_deploy.imaging.polarity import is_dark
 from gcar_deploy.types import Array, Image
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gcar_deploy.imaging.contrast import scaled_contrast
-from gcar_deploy.imaging.extract import bright_vessels
+from gcar_deploy.imaging.grey_values import bright_vessels
 from tests.imaging.phantoms import tube_paths
 
 PIXEL_MM = 0.3

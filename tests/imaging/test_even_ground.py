@@ -17,6 +17,7 @@ from gcar_deploy.types import Image, Mask
 from tests.imaging.phantoms import dice
 
 SIDE = 400
+PIXEL_MM = 0.36
 NO_HOLES = np.zeros((SIDE, SIDE), bool)
 #: (col, row) corners and width of the vessels, pixels
 VESSELS = (
@@ -48,7 +49,7 @@ def drawn(depth: bool) -> tuple[Image, Mask]:
 def test_the_whole_tree_is_seen_to_the_rim(depth: bool, noise: float) -> None:
     picture, mask = drawn(depth)
     grain = np.random.default_rng(1).normal(0, noise, picture.shape)
-    found = shadow((7 + 40 * (picture + grain)).astype(np.float32), NO_HOLES)
+    found = shadow((7 + 40 * (picture + grain)).astype(np.float32), NO_HOLES, PIXEL_MM)
     assert found is not None
     assert found.flat is not depth
     assert dice(found.mask, mask) > 0.97
@@ -56,10 +57,31 @@ def test_the_whole_tree_is_seen_to_the_rim(depth: bool, noise: float) -> None:
 
 def test_gain_and_offset_change_nothing() -> None:
     picture, _ = drawn(True)
-    one, other = (shadow(p.astype(np.float32), NO_HOLES) for p in (picture, 300 * picture - 80))
+    one, other = (
+        shadow(p.astype(np.float32), NO_HOLES, PIXEL_MM) for p in (picture, 300 * picture - 80)
+    )
     assert one is not None
     assert other is not None
     assert np.array_equal(one.mask, other.mask)
+
+
+@pytest.mark.parametrize("margin", [2, 10, 30])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_empty_ground_that_is_cut_off_changes_nothing(margin: int, noise: float) -> None:
+    grain = np.random.default_rng(1).normal(0, noise, NO_HOLES.shape)
+    picture, mask = drawn(True)
+    picture = (picture + grain).astype(np.float32)
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    part = np.s_[rows[0] - margin : rows[-1] + margin + 1,
+                 columns[0] - margin : columns[-1] + margin + 1]  # fmt: skip
+    whole = shadow(picture, NO_HOLES, PIXEL_MM)
+    cut = shadow(picture[part], NO_HOLES[part], PIXEL_MM)
+    assert whole is not None
+    assert cut is not None
+    if noise:
+        assert dice(cut.mask, whole.mask[part]) > 0.995
+    else:
+        assert np.array_equal(cut.mask, whole.mask[part])
 
 
 def test_letters_are_no_vessel() -> None:
@@ -67,10 +89,20 @@ def test_letters_are_no_vessel() -> None:
     corner = np.s_[:45, 290:]
     written = picture.astype(np.uint8)
     cv2.putText(written, "LAO", (300, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
-    found = shadow(written.astype(np.float32), NO_HOLES)
+    found = shadow(written.astype(np.float32), NO_HOLES, PIXEL_MM)
     assert found is not None
     assert not found.mask[corner].any()
     assert dice(found.mask, mask) > 0.99
+
+
+def test_letters_blacker_than_any_vessel_are_none() -> None:
+    picture, mask = drawn(True)
+    for column in range(300, 360, 6):
+        picture[10:30, column : column + 2] = 3.0
+    found = shadow(picture, NO_HOLES, PIXEL_MM)
+    assert found is not None
+    assert not found.mask[:45, 290:].any()
+    assert dice(found.mask, mask) > 0.97
 
 
 @pytest.mark.parametrize("radius", [190, 400])
@@ -80,7 +112,7 @@ def test_what_runs_across_the_whole_picture_is_no_vessel_of_it(radius: int) -> N
     row, col = np.indices(picture.shape)
     holes = np.hypot(row - 199.5, col - 199.5) > radius
     band = np.exp(-(((row - 200 - 0.2 * col) / 8) ** 2)).astype(np.float32)
-    assert shadow(picture + 0.4 * band, holes) is None
+    assert shadow(picture + 0.4 * band, holes, PIXEL_MM) is None
 
 
 def test_grain_that_is_coarser_in_dark_parts_is_no_vessel() -> None:
@@ -89,17 +121,17 @@ def test_grain_that_is_coarser_in_dark_parts_is_no_vessel() -> None:
     row, col = np.indices(picture.shape)
     cloud = np.hypot(row - 80, col - 310) < 45
     grain = np.random.default_rng(8).normal(0, 1, picture.shape)
-    assert shadow((picture + 0.01 * grain).astype(np.float32), NO_HOLES) is not None
+    assert shadow((picture + 0.01 * grain).astype(np.float32), NO_HOLES, PIXEL_MM) is not None
     rough = picture + np.where(cloud, 0.06, 0.01) * grain
     assert not (cloud & mask).any()
-    assert shadow(rough.astype(np.float32), NO_HOLES) is None
+    assert shadow(rough.astype(np.float32), NO_HOLES, PIXEL_MM) is None
 
 
 def test_what_comes_in_from_one_side_is_drawn_with_the_vessels() -> None:
     picture, mask = drawn(True)
     row, col = np.indices(picture.shape)
     come = np.exp(-(((row - 200 - 0.2 * col) / 8) ** 2)) * (col < 150)
-    found = shadow((picture + 0.4 * come).astype(np.float32), NO_HOLES)
+    found = shadow((picture + 0.4 * come).astype(np.float32), NO_HOLES, PIXEL_MM)
     assert found is not None
     assert (found.mask & mask).sum() > 0.95 * mask.sum()
 
@@ -110,7 +142,7 @@ def test_light_may_fall_off_and_grain_may_be_coarse(noise: float) -> None:
     row, col = np.indices(picture.shape) / SIDE
     light = 2.0 - (row - 0.4) ** 2 - 0.7 * col
     grain = np.random.default_rng(3).normal(0, noise, picture.shape)
-    found = shadow((picture - light + grain).astype(np.float32), NO_HOLES)
+    found = shadow((picture - light + grain).astype(np.float32), NO_HOLES, PIXEL_MM)
     assert found is not None
     assert dice(found.mask, mask) > 0.9
 
@@ -133,7 +165,7 @@ def test_other_pictures_are_left_to_the_filters(what: str) -> None:
         picture = picture - 0.5 * (row < 0.1)
     if what == "holes":
         holes = ~NO_HOLES
-    assert shadow(picture.astype(np.float32), holes) is None
+    assert shadow(picture.astype(np.float32), holes, PIXEL_MM) is None
 
 
 @pytest.mark.parametrize("grain", [0.01, 0.06])
@@ -143,7 +175,7 @@ def test_a_hill_of_the_ground_is_no_vessel(height: float, grain: float) -> None:
     row, col = np.indices(picture.shape) / SIDE
     hill = height * np.exp(-((col - 0.2) ** 2 + (row - 0.9) ** 2) / (2 * 0.2**2))
     noise = np.random.default_rng(5).normal(0, grain, picture.shape)
-    found = shadow((picture + hill + noise).astype(np.float32), NO_HOLES)
+    found = shadow((picture + hill + noise).astype(np.float32), NO_HOLES, PIXEL_MM)
     assert found is None or (found.mask & ~mask).sum() < 0.1 * mask.sum()
 
 
@@ -153,7 +185,7 @@ def test_speckles_on_the_top_of_a_low_cloud_are_no_vessel(height: float, width: 
     row, col = np.indices(picture.shape)
     cloud = height * np.exp(-((row / width) ** 2 + ((col - 100) / 60) ** 2) / 2)
     noise = np.random.default_rng(2).normal(0, 0.01, picture.shape)
-    found = shadow((picture + cloud + noise).astype(np.float32), NO_HOLES)
+    found = shadow((picture + cloud + noise).astype(np.float32), NO_HOLES, PIXEL_MM)
     assert found is not None
     assert (found.mask & ~mask).sum() < 20
     assert dice(found.mask, mask) > 0.95

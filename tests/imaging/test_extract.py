@@ -10,9 +10,9 @@ from gcar_deploy.errors import GeometryError, ImageError, RefusedError
 from gcar_deploy.imaging.extract import (
     CONTRAST_ERROR,
     asks_network,
-    bright_vessels,
     extract_vessels,
 )
+from gcar_deploy.imaging.grey_values import bright_vessels
 from gcar_deploy.imaging.polarity import with_polarity
 from gcar_deploy.imaging.resample import (
     area_average,

@@ -6,8 +6,9 @@ import pytest
 
 from gcar_deploy.config import ImagingOptions
 from gcar_deploy.errors import RefusedError, UsageError
-from gcar_deploy.imaging.extract import bright_vessels, extract_vessels
+from gcar_deploy.imaging.extract import extract_vessels
 from gcar_deploy.imaging.fusion import fused
+from gcar_deploy.imaging.grey_values import bright_vessels
 from gcar_deploy.imaging.net import load_segmenter
 from gcar_deploy.imaging.skeleton import skeletonize
 from tests.conftest import data_dir
