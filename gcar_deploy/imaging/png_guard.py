@@ -218,7 +218,9 @@ def _check_tiff_page(
     if len(depths) != 1 or not depths <= {8, 16, 32, *([1] if binary else [])}:
         raise ValueError(f"has {sorted(depths)} bits per sample; {_TIFF_KINDS}")
     if formats != {_FLOATING if 32 in depths else _UNSIGNED}:
-        raise ValueError(f"holds signed samples or floating-point numbers of 16 bit; {_TIFF_KINDS}")
+        kinds = {1: "unsigned", 2: "signed", 3: "floating-point"}
+        kind = " and ".join(kinds.get(one_of, "odd") for one_of in sorted(formats))
+        raise ValueError(f"holds {kind} samples of {max(depths)} bit; {_TIFF_KINDS}")
     if one(tags, 262, -1) not in (1, 2):
         raise ValueError("is not plain grey (black is zero); export it as 8 or 16 bit grey")
     if one(tags, 274, 1) != 1:

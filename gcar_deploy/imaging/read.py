@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 #: the level of OpenCV's messages is one for all threads
 _ONE_DECODER = threading.Lock()
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
+_BIG_TIFF = (b"II+\x00", b"MM\x00+")
 _NPY_DEPTH = {"uint8": 8, "uint16": 16, "float32": 32, "float64": 64}
 _TYPE_OF = {8: np.uint8, 16: np.uint16, 32: np.float32}
 #: a multi-page file that is larger is no run
@@ -165,6 +166,8 @@ def _decode(data: bytes, suffix: str, limits: PictureLimits, binary: bool) -> tu
         )
     if expected is None:
         raise ValueError("has an unknown kind of name; use .png, .tif, .tiff, .npy or DICOM")
+    if data.startswith(_BIG_TIFF):
+        raise ValueError("is a BigTIFF file; export it as TIFF of up to 4 GB, or as PNG")
     found = _sniff(data)
     if found != expected:
         what = f"is a {found} file" if found else f"is not a {expected} file"

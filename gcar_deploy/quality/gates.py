@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -57,7 +58,7 @@ def check_views(angiograms: Sequence[Angiogram], options: QualityOptions) -> lis
     angle = best_separation([angiogram.carm for angiogram in angiograms])
     if angle < options.min_separation_deg:
         raise RefusedError(
-            f"views are {angle:.1f} deg apart (folded to 0 .. 90); at least "
+            f"views are {math.floor(100 * angle) / 100:g} deg apart (folded to 0 .. 90); at least "
             f"{options.min_separation_deg:g} deg are needed to see depth"
             + _in_radians([angiogram.carm for angiogram in angiograms], options)
         )

@@ -39,6 +39,12 @@ def turned(angiogram, primary):
     return dataclasses.replace(angiogram, carm=carm)
 
 
+def test_a_separation_just_below_the_least_is_not_told_as_that(case):
+    pair = [turned(case[0][0], 0.0), turned(case[0][1], 4.996)]
+    with pytest.raises(RefusedError, match=r"are 4\.99 deg apart .* at least 5 deg"):
+        check_views(pair, OPTIONS)
+
+
 @pytest.mark.parametrize(
     ("second", "outcome"),
     [(3, "refused"), (4.9, "refused"), (5.1, "degraded"), (24, "degraded"), (26, "ok"),
