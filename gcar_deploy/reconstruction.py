@@ -26,7 +26,7 @@ from gcar_deploy.geometry.observability import (
 from gcar_deploy.geometry.own_frame import OwnFrame
 from gcar_deploy.geometry.scene import told_view
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.own_frame import found_as_given
+from gcar_deploy.imaging.own_frame import found_as_given, turns_back
 from gcar_deploy.measure import BranchName, Measured, Sections, lumen_tree, measured
 from gcar_deploy.measure.lumen import BranchLumen, tree_lumens
 from gcar_deploy.measure.naming import LEAST_CONFIDENCE
@@ -165,8 +165,11 @@ class Reconstruction:
         """
         places = [frame.place(k) for k in range(len(angiograms))]
         poses = tuple(
-            dataclasses.replace(self.poses[p], partner=frame.order[self.poses[p].partner])
-            for p in places
+            dataclasses.replace(
+                self.poses[p].seen_turned(turns_back(frame, k)),
+                partner=frame.order[self.poses[p].partner],
+            )
+            for k, p in enumerate(places)
         )
         views = tuple(
             dataclasses.replace(found, carm=pose.applied(found.carm))

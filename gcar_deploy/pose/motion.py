@@ -85,6 +85,17 @@ class Motion:
             out[part] = _kernel(places[part], self.nodes_mm) @ self.weights
         return out[:, None] * self.direction / size
 
+    def turned(self, turns: int) -> Motion:
+        """Return the motion of the picture turned anticlockwise by so many quarter turns."""
+        out = self
+        for _ in range(turns % 4):
+            nodes, (right, down) = out.nodes_mm, out.direction
+            out = dataclasses.replace(
+                out, nodes_mm=np.stack([nodes[:, 1], -nodes[:, 0]], axis=1),
+                direction=np.array([down, -right]),
+            )  # fmt: skip
+        return out
+
     def undone(self, view: VesselImage) -> VesselImage:
         """Return a view as it would show the heart where the other view shows it."""
         column, row = self._sources(view.carm)

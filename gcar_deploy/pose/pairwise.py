@@ -123,6 +123,12 @@ class Pose:
             self, offset_mm=(x, y, z), primary_deg=primary, secondary_deg=secondary
         )
 
+    def seen_turned(self, turns: int) -> Pose:
+        """Return the pose of the picture turned anticlockwise by so many quarter turns."""
+        if self.motion is None or not turns:
+            return self
+        return dataclasses.replace(self, motion=self.motion.turned(turns))
+
     def applied(self, carm: CArm) -> CArm:
         """Return the view with the correction built in."""
         return corrected(carm, self.theta)
