@@ -14,7 +14,7 @@ from gcar_deploy.measure.metrics import VOLUME_MEASURES, Measure, volume_measure
 from gcar_deploy.types import Array, Volume
 from gcar_export.evaluate.jobs import connected_parts
 from gcar_export.evaluate.tables import MEASURES
-from gcar_export.scenes.labels import LabelVolume, read_label
+from gcar_export.scenes.labels import EmptyLabelError, LabelVolume, read_label
 
 #: lattices that are so much of a voxel apart are the same
 SAME_LATTICE = 1e-3
@@ -45,10 +45,16 @@ def compare(volume: Path, truth: Path) -> Compared:
     Raises
     ------
     UsageError
-        One cannot be read, is empty or no label of vessels; the two lie beside each other.
+        One cannot be read or is no label of vessels; the truth is empty; the two lie beside each
+        other.
     """
-    mine, true = read_label(volume, shares=True), read_label(truth, shares=True)
-    mine, true = mine.cropped(), true.cropped()
+    true = read_label(truth, shares=True).cropped()
+    try:
+        mine = read_label(volume, shares=True).cropped()
+    except EmptyLabelError:
+        # Whoever found nothing has no measures, and each says why.
+        nothing = np.zeros_like(true.occupancy)
+        return Compared(resampled=False, measures=_measures(true.occupancy, nothing, true))
     _refuse_apart(mine, true, volume, truth)
     spacing = np.asarray(true.grid.spacing_mm)
     before = _voxels(true.grid.lower_mm - mine.grid.lower_mm, spacing)
@@ -65,9 +71,13 @@ def compare(volume: Path, truth: Path) -> Compared:
     resampled = found is None
     if found is None:
         found = mine.on_grid(grid)
+    return Compared(resampled=resampled, measures=_measures(expected, found, true))
+
+
+def _measures(expected: Volume, found: Volume, true: LabelVolume) -> dict[str, Measure]:
     names = [name for name in VOLUME_MEASURES if name not in _LEFT_OUT]
-    measures = volume_measures(expected, found, spacing, names)
-    return Compared(resampled=resampled, measures={**measures, "parts": connected_parts(found)})
+    measures = volume_measures(expected, found, np.asarray(true.grid.spacing_mm), names)
+    return {**measures, "parts": connected_parts(found)}
 
 
 def table(found: Compared) -> str:

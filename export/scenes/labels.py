@@ -49,6 +49,10 @@ SHARE = 0.5
 SAMPLES = 3
 
 
+class EmptyLabelError(UsageError):
+    """A label volume without any vessel."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class LabelVolume:
     """Share of each voxel that is vessel, on a block of voxels parallel to LPS.
@@ -235,7 +239,7 @@ def read_label(path: str | Path, *, shares: bool = False) -> LabelVolume:
         reason = (str(error).splitlines() or [""])[0].replace(str(path), "it")[:200]
         raise UsageError(f"{path}: cannot be read ({reason or type(error).__name__})") from None
     if not label.occupancy.any():
-        raise UsageError(f"{path}: the label volume is empty")
+        raise EmptyLabelError(f"{path}: the label volume is empty")
     low, high = _occupied_box(label.occupancy)
     share = float(np.prod(high - low + 1)) / label.occupancy.size
     return label.cropped() if share < CROP_BELOW else label
@@ -353,7 +357,7 @@ def _read_npz(path: Path, case: str) -> LabelVolume:
 def _resampled(array: Array, index2lps: Array, name: str) -> LabelVolume:
     occupied = np.argwhere(array > 0)
     if not len(occupied):
-        raise UsageError(f"{name}: the label volume is empty")
+        raise EmptyLabelError(f"{name}: the label volume is empty")
     step = float(np.linalg.norm(index2lps[:3, :3], axis=0).min())
     low, high = occupied.min(0) - 1, occupied.max(0) + 1
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -394,7 +398,7 @@ def _occupied_box(occupancy: Array) -> tuple[Array, Array]:
         others = tuple(a for a in range(3) if a != axis)
         hit = np.flatnonzero((occupancy > 0).any(axis=others))
         if not len(hit):
-            raise UsageError("the label volume is empty")
+            raise EmptyLabelError("the label volume is empty")
         low.append(hit[0])
         high.append(hit[-1])
     return np.array(low), np.array(high)

@@ -67,6 +67,17 @@ def test_a_finer_lattice_is_brought_onto_the_truths(tree, tmp_path):
     assert "resampled onto the truth" in own_volume.table(found)
 
 
+def test_a_method_that_found_nothing_has_reasons_for_measures(tree, tmp_path):
+    truth, mine = save(tmp_path / "t.nii.gz", tree), save(tmp_path / "m.nii.gz", 0 * tree)
+    found = own_volume.compare(mine, truth).measures
+    assert found["dsc"].value is None and "empty" in found["dsc"].reason
+    assert found["parts"].value is None and "empty" in found["parts"].reason
+    done = CliRunner().invoke(main, ["score", "--volume", str(mine), "--truth", str(truth)])
+    assert done.exit_code == 0 and "| DSC(0.5) % | - (" in done.output, done.output
+    with pytest.raises(UsageError, match="the label volume is empty"):
+        own_volume.compare(truth, mine)
+
+
 def test_two_frames_and_a_call_without_its_other_half_are_refused(tree, tmp_path):
     truth, mine = (save(tmp_path / "t.nii.gz", tree),
                    save(tmp_path / "m.nii.gz", tree, (100, 0, 0)))  # fmt: skip
