@@ -59,7 +59,8 @@ class Angiogram:
     file : str
         Name of the file that it was read from; empty for an array.
     enlarged : float
-        How many times as many rows it has as the geometry says; below 1 it was made smaller.
+        How many times as many rows it has as the geometry says; below 1 it was made smaller. On
+        square pixels that are finer than those that came, as many times more.
     """
 
     view_id: str

@@ -59,6 +59,7 @@ def squared(angiogram: Angiogram) -> Angiogram:
         erased=drawn(angiogram.erased),
         painted=drawn(angiogram.painted),
         bare=tuple(weighted(frame, down, across) for frame in angiogram.bare),
+        enlarged=angiogram.enlarged * max(scales),
     )
 
 

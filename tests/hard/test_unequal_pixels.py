@@ -12,7 +12,7 @@ from gcar_deploy.engine import Engine
 from gcar_deploy.geometry.own_frame import own_frame
 from gcar_deploy.geometry.scene import Intensity
 from gcar_deploy.imaging.own_frame import in_own_frame
-from gcar_deploy.imaging.square import square_point, squared
+from gcar_deploy.imaging.square import square_point, square_scales, squared
 from tests.hard.phantoms import (
     GRID,
     PAIR,
@@ -108,6 +108,7 @@ def test_points_and_what_is_drawn_go_with_the_pixels(shape):
     assert abs(new.focal_px[0] / new.focal_px[1] - 1) < 1e-9
     for old, there in zip(view.project(points)[0], new.project(points)[0], strict=True):
         np.testing.assert_allclose(square_point(view, tuple(old)), there, atol=1e-9)
+    assert done.enlarged == max(square_scales(view))
     shapes = {one.shape for one in (done.pixels, done.mask, done.painted, *done.bare)}
     assert shapes == {(new.rows, new.columns)}
     off = done.pixels - path_of(straight(), new)
