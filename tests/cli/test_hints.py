@@ -58,6 +58,7 @@ def test_pose_off_estimates_nothing(good_case, tmp_path):
     assert view["disagreement_after"] == view["disagreement_before"]
 
 
+@pytest.mark.slow
 def test_a_result_says_which_geometry_and_masks_it_is_of(good_case, tmp_path):
     mask = tmp_path / "mine.png"
     grey = cv2.imread(str(good_case / "view1.png"), cv2.IMREAD_UNCHANGED)

@@ -98,6 +98,7 @@ def test_the_scene_and_what_is_found_are_the_same(turns: tuple[int, int], kind: 
             assert np.array_equal(np.rot90(getattr(one, name), k), getattr(other, name)), name
 
 
+@pytest.mark.slow
 def test_the_tree_is_the_same() -> None:
     angiograms, grid, _ = tiny_case()
     engine = Engine(threads=1, options=RunOptions(predict=PredictOptions(predictor="none")))

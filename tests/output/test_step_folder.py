@@ -70,6 +70,7 @@ def test_pictures_are_what_was_found(kept):
         np.testing.assert_allclose(counts * PATH_COUNT_MM, view.path_mm, atol=PATH_COUNT_MM)
 
 
+@pytest.mark.slow
 def test_pictures_have_the_pixels_that_were_given(tmp_path):
     """Found on square pixels, written on those of the picture."""
     long = {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.49, 0.98), "sdd_mm": 1299.0}

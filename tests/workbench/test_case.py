@@ -59,6 +59,7 @@ def test_a_request_gets_its_own_pictures_whatever_others_read_meanwhile(desk, mo
     assert len(case.angiograms()) == 2
 
 
+@pytest.mark.slow
 def test_what_was_found_is_shown_on_the_pixels_of_the_picture(desk):
     case = desk.demo()
     long = {"rows": 256, "columns": 128, "pixel_spacing_mm": (0.49, 0.98), "sdd_mm": 1299.0}

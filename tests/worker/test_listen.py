@@ -113,6 +113,7 @@ def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, sai
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_study_waits_for_its_own_sender(listening, runs):
     port, orders, _, queue = listening
     data = [pydicom.dcmread(file) for file in runs[1]]
@@ -131,6 +132,7 @@ def test_a_study_waits_for_its_own_sender(listening, runs):
     assert [len(views) for _, views in orders] == [3]
 
 
+@pytest.mark.slow
 def test_two_orders_of_a_study_at_work_have_a_folder_each(runs, tmp_path):
     study, files = runs
     at_work, outs = threading.Event(), []

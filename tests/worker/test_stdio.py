@@ -239,6 +239,7 @@ def test_a_job_that_needs_too_much_memory_fails_alone(good_case, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out1"]
 
 
+@pytest.mark.slow
 def test_a_full_queue_is_said_and_keeps_no_copies(
     make_queue, case_folder, tmp_path, gate, monkeypatch
 ):
