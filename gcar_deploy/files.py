@@ -1,4 +1,4 @@
-"""Files by name and content: read once, with a limit; no pipe is waited for, no device is read."""
+"""Files by name and content: read once, with a limit, written whole; no pipe or device is read."""
 
 from __future__ import annotations
 
@@ -187,3 +187,29 @@ def text_of(data: bytes) -> str:
 
 def _size(count: int) -> str:
     return f"{count / 2**20:.4g} MiB" if count >= 2**20 else f"{count / 2**10:.4g} KiB"
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a place beside ``path`` to write to, which takes its place when all is written.
+
+    Nothing stays there where that fails, as on a full disk.
+
+    Raises
+    ------
+    OSError
+        It cannot be written; ``filename`` is the path.
+    """
+    # Two processes may draw the same picture.
+    partial = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        yield partial
+        partial.replace(path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(partial), partial):
+            raise
+        # What fails at writing knows no name of the file.
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.files import whole_file
 from gcar_deploy.measure.metrics import (
     VOLUME_MEASURES,
     Measure,
@@ -31,7 +32,6 @@ from gcar_export.scenes.labels import LabelVolume, case_stem, read_label
 from gcar_export.scenes.protocols import COMMON, Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
 from gcar_export.scenes.thin_protocol import THIN, line_measures, thin_case
-from gcar_export.scenes.whole_file import whole_file
 
 #: name that the truth's own pictures are kept under, beside the methods.
 TRUTH = "truth"

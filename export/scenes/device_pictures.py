@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gcar_deploy.files import whole_file
 from gcar_deploy.imaging import learned, line_chains, line_strips
 from gcar_deploy.imaging.learned import vessel_lines
 from gcar_deploy.imaging.line_strips import LinePoints, line_points
@@ -29,7 +30,6 @@ from gcar_export.scenes.cine import cine_pair
 from gcar_export.scenes.drawn_devices import drawn_devices as drawn
 from gcar_export.scenes.expert_pictures import ExpertPicture
 from gcar_export.scenes.raw_angiograms import raw_angiogram
-from gcar_export.scenes.whole_file import whole_file
 
 #: enlargement of a picture that fills the network's field, and how far it is turned, degrees
 ZOOM, TURN_DEG = (1.0, 1.2), 8.0

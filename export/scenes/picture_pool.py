@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gcar_deploy.files import whole_file
 from gcar_export.scenes import (
     angiogram_scenery,
     angiogram_vessels,
@@ -24,7 +25,6 @@ from gcar_export.scenes import (
 from gcar_export.scenes.angiograms import GeneratedAngiogram, asked_of, generated_angiogram
 from gcar_export.scenes.augmented import Labelled
 from gcar_export.scenes.raw_angiograms import raw_angiogram
-from gcar_export.scenes.whole_file import whole_file
 
 #: enlargement of a crop, and of a raw picture's, which is twice as fine
 ZOOM, RAW_ZOOM = (0.9, 1.3), (0.62, 1.0)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from gcar_deploy.config import QualityOptions
+from gcar_deploy.files import whole_file
 from gcar_deploy.quality import check_order, disagreement_limits
 from gcar_deploy.quality.status import DEGRADED, OK, REFUSED
-from gcar_export.scenes.whole_file import whole_file
 from gcar_export.studies.gate_pairs import KINDS, PICTURES, UNITS, WRONG
 from gcar_export.studies.gate_rows import Row
 from gcar_export.studies.gate_table import GATES, choose, cost, kind_of_row, replayed, with_gate

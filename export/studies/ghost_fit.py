@@ -17,9 +17,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
+from gcar_deploy.files import whole_file
 from gcar_deploy.quality import FIGURES, GHOST_MM, GhostModel
 from gcar_deploy.types import Array, Scalars
-from gcar_export.scenes.whole_file import whole_file
 from gcar_export.studies.gate_pairs import PICTURES
 from gcar_export.studies.gate_rows import Row
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from gcar_deploy.config import RefineOptions, RefinerName, RunOptions
+from gcar_deploy.files import whole_file
 from gcar_deploy.gaussians.centers import CenterPoints
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.imaging.angiogram import VesselImage
@@ -37,7 +38,6 @@ from gcar_export.evaluate.tables import STARS
 from gcar_export.scenes.labels import read_label
 from gcar_export.scenes.protocols import Case, make_case
 from gcar_export.scenes.raycast import as_label, raycast
-from gcar_export.scenes.whole_file import whole_file
 
 DROPPED = 0.1
 #: rows of the table: refiner, and whether the loss has its centreline part

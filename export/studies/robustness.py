@@ -34,6 +34,7 @@ import numpy as np
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.files import whole_file
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
@@ -44,7 +45,6 @@ from gcar_export.evaluate.evaluate import find_labels
 from gcar_export.scenes.labels import LabelVolume, case_stem, read_label
 from gcar_export.scenes.protocols import MM_PER_COUNT
 from gcar_export.scenes.raycast import raycast
-from gcar_export.scenes.whole_file import whole_file
 
 CURVES: dict[str, tuple[float, ...]] = {
     "separation": (25, 35, 45, 60, 75, 90),

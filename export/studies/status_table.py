@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from gcar_deploy.config import QualityOptions
+from gcar_deploy.files import whole_file
 from gcar_deploy.quality.status import DEGRADED, OK, REFUSED
 from gcar_deploy.types import Array
-from gcar_export.scenes.whole_file import whole_file
 from gcar_export.studies.gate_pairs import PICTURES, WRONG
 from gcar_export.studies.gate_rows import Row
 from gcar_export.studies.gate_table import GATES, expected_ghosts, replayed, with_gate

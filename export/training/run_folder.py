@@ -28,7 +28,7 @@ from safetensors.torch import save
 
 from gcar_deploy.batch.lock import only_one
 from gcar_deploy.errors import ModelError, UsageError
-from gcar_export.scenes.whole_file import whole_file
+from gcar_deploy.files import whole_file
 from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
 from gcar_export.training.run_log import draw_curve, read_log
 from gcar_export.training.scene_stream import Terminated

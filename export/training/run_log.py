@@ -6,7 +6,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gcar_export.scenes.whole_file import whole_file
+from gcar_deploy.files import whole_file
 
 
 def read_log(file: Path) -> list[dict[str, str]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from gcar_deploy.batch.summary import write_summary
 from gcar_deploy.batch.work import BatchJob
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
-from gcar_deploy.files import is_there
+from gcar_deploy.files import is_there, whole_file
 
 SCHEMA = "gcar-batch/1"
 #: statuses of cases that have a result folder
@@ -141,6 +140,5 @@ def _read_row(path: Path) -> dict[str, Any] | None:
 
 
 def _write_row(path: Path, row: Mapping[str, Any]) -> None:
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    partial.write_text(json.dumps(row, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(row, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -25,7 +25,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _VIEW = re.compile(r"view([1-9][0-9]?)")
 _MASK = re.compile(rf"mask({VIEW_NUMBER})")
 #: what a batch itself puts beside its cases
-_RESERVED = re.compile(r"rows|batch\.json|summary\.(csv|html)(\.partial)?", re.IGNORECASE)
+_RESERVED = re.compile(
+    r"rows|batch\.json|summary\.(csv|html)(\.partial|\.\d+\.tmp)?", re.IGNORECASE
+)
 MOST_CASES = 100_000
 #: a run would not read more of a file or folder either
 _LIMITS = DicomLimits()

@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from gcar_deploy.batch.work import COLUMNS
+from gcar_deploy.files import whole_file
 from gcar_deploy.output.report import page_policy
 from gcar_deploy.reconstruction import RESEARCH_USE
 
@@ -42,9 +43,8 @@ def write_summary(rows: Sequence[Mapping[str, Any]], out: Path, *, of: int | Non
     """
     page = summary_html(rows, out, of=of)
     for name, text in (("summary.csv", summary_csv(rows)), ("summary.html", page)):
-        partial = out / f"{name}.partial"
-        partial.write_text(text, encoding="utf-8", newline="")
-        partial.replace(out / name)
+        with whole_file(out / name) as partial:
+            partial.write_text(text, encoding="utf-8", newline="")
 
 
 def summary_csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -166,9 +166,11 @@ def scene_to_json(scene: Scene) -> str:
 
 def told_view(carm: CArm, intensity: Intensity) -> dict[str, Any]:
     """Return a view as ``geom.json`` tells it but for its id, without what is left open."""
-    everything = {**_values(carm), "intensity": dataclasses.asdict(intensity)}
-    everything["intensity"] = {k: v for k, v in everything["intensity"].items() if v is not None}
-    return {key: value for key, value in everything.items() if value is not None}
+    view, meaning = (
+        {key: value for key, value in all_of_it.items() if value is not None}
+        for all_of_it in (_values(carm), dataclasses.asdict(intensity))
+    )
+    return {**view, "intensity": meaning}
 
 
 def _values(carm: CArm) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from gcar_deploy.imaging.mask_path import mask_path
 from gcar_deploy.imaging.net import MISSING, Segmenter
 from gcar_deploy.imaging.path_noise import vessels_in_noise
 from gcar_deploy.imaging.polarity import is_dark, with_polarity
-from gcar_deploy.imaging.shadow_devices import comes_from_outside, without_devices
+from gcar_deploy.imaging.shadow_devices import reaches_the_end, without_devices
 from gcar_deploy.imaging.standing import what_came, without_standing
 from gcar_deploy.imaging.thin_mask import refuse_thin
 from gcar_deploy.imaging.widths import MASK_ERROR
@@ -175,7 +175,7 @@ def _from_shadow(
     else:
         view = _from_grey(seen, grey, None, EVEN_LENGTH_MM)
     pixel_mm = angiogram.carm.pixel_at_isocenter_mm
-    if not comes_from_outside(drawn.mask, grey[1], pixel_mm):
+    if not reaches_the_end(drawn.mask, grey[1], pixel_mm):
         return view
     with contextlib.suppress(RefusedError):
         filtered, *_ = _lines(angiogram, grey, None)

@@ -23,7 +23,7 @@ from gcar_deploy.imaging.resample import resize
 from gcar_deploy.types import Image, Mask
 
 
-def comes_from_outside(shadow: Mask, holes: Mask, pixel_mm: float) -> bool:
+def reaches_the_end(shadow: Mask, holes: Mask, pixel_mm: float) -> bool:
     """Whether something on an even ground reaches the end of the picture, as catheters do.
 
     It does so to the last pixel; where a picture fades into holes, to near them.
@@ -56,7 +56,7 @@ def without_devices(
     ModelError, NumericalError, CancelledError
         As ``Segmenter.look``.
     """
-    if not comes_from_outside(view.mask, holes, view.carm.pixel_at_isocenter_mm):
+    if not reaches_the_end(view.mask, holes, view.carm.pixel_at_isocenter_mm):
         return view
     pixel_mm = view.carm.pixel_at_isocenter_mm
     work, work_holes = at_network_size(search, holes)

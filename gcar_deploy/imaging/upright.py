@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -57,17 +58,11 @@ def turned_point(
 
 def turned_angiogram(angiogram: Angiogram, carm: CArm, turns: int) -> Angiogram:
     """Return a picture and all that was drawn in it, turned; ``carm`` is the view it then has."""
-    if not turns:
-        return dataclasses.replace(angiogram, carm=carm)
     return dataclasses.replace(
         angiogram,
         carm=carm,
-        pixels=_turned(angiogram.pixels, turns),
-        valid=_turned(angiogram.valid, turns),
-        mask=_turned(angiogram.mask, turns),
-        erased=_turned(angiogram.erased, turns),
-        painted=_turned(angiogram.painted, turns),
         bare=tuple(_turned(frame, turns) for frame in angiogram.bare),
+        **_arrays(angiogram, ("pixels", "valid", "mask", "erased", "painted"), turns),
     )
 
 
@@ -79,21 +74,24 @@ def turned_view(found: VesselImage, carm: CArm, turns: int) -> VesselImage:
     return dataclasses.replace(
         found,
         carm=carm,
-        path_mm=_turned(found.path_mm, turns),
-        mask=_turned(found.mask, turns),
-        skeleton=_turned(found.skeleton, turns),
-        valid=_turned(found.valid, turns),
-        vesselness=_turned(found.vesselness, turns),
-        catheter=_turned(found.catheter, turns),
-        device=_turned(found.device, turns),
-        painted=_turned(found.painted, turns),
         others=tuple(turned_view(other, carm, turns) for other in found.others),
         kept=None if kept is None else lambda: turned_view(kept(), carm, turns),
+        **_arrays(
+            found,
+            ("path_mm", "mask", "skeleton", "valid", "vesselness", "catheter", "device", "painted"),
+            turns,
+        ),
     )
 
 
+def _arrays(of: Angiogram | VesselImage, names: Sequence[str], turns: int) -> dict[str, Any]:
+    return {name: _turned(getattr(of, name), turns) for name in names}
+
+
 def _turned(array: Any, turns: int) -> Any:
-    return None if array is None else np.ascontiguousarray(np.rot90(array, turns))
+    if array is None or not turns:
+        return array
+    return np.ascontiguousarray(np.rot90(array, turns))
 
 
 def _pixel_turn(carm: CArm, turns: int) -> Array:

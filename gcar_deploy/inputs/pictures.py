@@ -93,7 +93,7 @@ def prepare(
     for k, lines in (drawn or {}).items():
         place = _index(k, "edits", angiograms)
         angiograms[place] = with_drawn(angiograms[place], lines)
-        notes += [f"view {k}: {text}" for text in _said(lines, angiograms[k - 1].pixels.shape)]
+        notes += [f"view {k}: {text}" for text in _said(lines, angiograms[place].pixels.shape)]
     return angiograms, grid, notes
 
 

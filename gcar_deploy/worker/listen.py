@@ -20,6 +20,7 @@ from pynetdicom import AE, evt
 from gcar_deploy.config import DicomLimits
 from gcar_deploy.dicom.header import CLASSIC, ENHANCED, SYNTAXES
 from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.files import whole_file
 from gcar_deploy.geometry.fields import MOST_VIEWS
 from gcar_deploy.inputs.order import Order
 from gcar_deploy.worker.jobs import Job, JobQueue
@@ -144,9 +145,8 @@ class Listener:
             path = found.runs.get(instance) or found.scratch / f"run{len(found.runs) + 1}.dcm"
             try:
                 # A run counts once it is whole; one that is sent again is kept until then.
-                half = path.with_suffix(".part")
-                half.write_bytes(data)
-                half.replace(path)
+                with whole_file(path) as half:
+                    half.write_bytes(data)
             except OSError as error:
                 _log.error("study %s: a run cannot be written (%s)", study, error.strerror or error)
                 return OUT_OF_RESOURCES

@@ -43,12 +43,11 @@ class Received:
 
     def clean_inputs(self) -> None:
         """Remove the private copies of what the order named; a result among them stays."""
-        out = self.order.out
-        if self.scratch is None or out is None or not self.private:
+        if self.scratch is None or not self.private:
             self.clean()
             return
         for path in self.scratch.iterdir():
-            if path != out and not path.is_dir():
+            if not path.is_dir():
                 path.unlink(missing_ok=True)
 
     def clean(self) -> None:

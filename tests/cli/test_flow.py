@@ -7,6 +7,8 @@ import shutil
 
 import pytest
 
+from gcar_deploy.cli.flow import flow
+from gcar_deploy.flow import Assumption
 from tests.cli.conftest import gcar
 from tests.output.conftest import folder  # noqa: F401 - a fixture
 
@@ -53,6 +55,13 @@ def test_files_for_solvers(copy, tmp_path):
 def test_values_out_of_range(copy, option, value, says):
     done = gcar("flow", copy, option, value)
     assert done.code == 2 and says in done.err and done.err.count("\n") == 1
+
+
+def test_help_tells_the_defaults_that_hold():
+    told = {p.name: getattr(p, "show_default", None) for p in flow.params}
+    shown = {name: text for name, text in told.items() if isinstance(text, str)}
+    assert set(shown) == {"velocity_m_s", "aortic_pressure_mmhg"}
+    assert shown == {name: f"{getattr(Assumption(), name):g}" for name in shown}
 
 
 def test_flow_and_velocity_together_are_refused(copy):

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the export extra")
 
-from gcar_export.scenes.whole_file import whole_file
+from gcar_deploy.files import whole_file
 from gcar_export.training import segmenter
 from gcar_export.training.loop import _Run
 
