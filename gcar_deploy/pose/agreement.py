@@ -11,9 +11,15 @@ from typing import TypeAlias
 import numpy as np
 
 from gcar_deploy.config import PoseOptions, RunOptions
-from gcar_deploy.geometry.consistency import Mass, disagreement, mass_profiles, vessel_mass
+from gcar_deploy.geometry.consistency import (
+    Mass,
+    chequered,
+    disagreement,
+    mass_profiles,
+    vessel_mass,
+)
 from gcar_deploy.imaging.angiogram import Angiogram, VesselImage
-from gcar_deploy.imaging.resample import sampled_path
+from gcar_deploy.imaging.resample import coarsened, sampled_path
 from gcar_deploy.imaging.widths import by_width, others_too, own_widths
 from gcar_deploy.pose.frontier import by_frontiers
 from gcar_deploy.pose.landmarks import landmark_pixels
@@ -21,6 +27,7 @@ from gcar_deploy.pose.motion import estimate_motion, still
 from gcar_deploy.pose.pairwise import Pose, estimate_poses, judged_poses, worst_of
 from gcar_deploy.pose.partners import GAIN, partnered, shown_share
 from gcar_deploy.quality import Remark, check_order, disagreement_limits, kind_of
+from gcar_deploy.types import Image
 
 _log = logging.getLogger(__name__)
 #: poses of readings of the views, after a look whether there is still time
@@ -212,7 +219,17 @@ def poses_between(
     if known is not None:
         return judged_poses(known, small, pose, marks, calibrated)
     masks = [view.kind == "mask" for view in views]
-    return estimate_poses(small, pose, marks, calibrated, masks)
+    return estimate_poses(small, pose, marks, calibrated, masks, _grains(views, options))
+
+
+def _grains(views: Sequence[VesselImage], options: RunOptions) -> list[Image | None]:
+    """Return the grain of calibrated views, with the pixels of ``sampled_path``."""
+    cell = options.predict.min_cell_mm
+    return [
+        coarsened(v.carm, (chequered(v.path_mm),), cell / v.carm.pixel_at_isocenter_mm)[1][0]
+        if v.calibrated else None
+        for v in views
+    ]  # fmt: skip
 
 
 def profiled(

@@ -22,6 +22,7 @@ from gcar_deploy.geometry.consistency import (
     disagreement,
     mass_profiles,
     mismatch,
+    sampling_noise,
     uncovered_mm,
     vessel_mass,
 )
@@ -31,6 +32,7 @@ from gcar_deploy.imaging.angiogram import Angiogram
 from gcar_deploy.pose.joint import corrected, estimate_jointly
 from gcar_deploy.pose.motion import Motion
 from gcar_deploy.pose.profile_fit import (
+    CALIBRATED_NOISE,
     MIN_GAIN,
     MOST_APART_DEG,
     SEARCH_MM,
@@ -46,8 +48,9 @@ from gcar_deploy.types import Array, Image, Pixels
 #: corrections from these on are said in words: more than a breath between two runs leaves, or
 #: than a gantry's display is off
 SAID_SHIFT_MM, SAID_TURN_DEG = 2.0, 1.0
-#: calibrated pictures that agree so well as they are told are left alone: pixels, not poses
-AGREED_CALIBRATED = 0.002
+#: calibrated pictures that differ as they are told by no more times what their pixels alone make of
+#: it are left alone
+AGREED_GRAIN = 3.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -162,6 +165,7 @@ def estimate_poses(
     landmarks: Array | None = None,
     calibrated: Sequence[bool] | None = None,
     masks: Sequence[bool] | None = None,
+    grains: Sequence[Image | None] | None = None,
 ) -> tuple[Pose, ...]:
     """Estimate the correction of every view against the first, directly or through others.
 
@@ -180,6 +184,7 @@ def estimate_poses(
         not seen; the rays of one point must meet
     calibrated : per view, whether the path lengths are in mm; none where left out
     masks : per view, whether they are told by the width of a mask; none where left out
+    grains : per view (rows, cols), see ``Mass``, or None
 
     Returns
     -------
@@ -188,7 +193,11 @@ def estimate_poses(
     marks = np.empty((0, len(views), 2)) if landmarks is None else landmarks
     exact = [False] * len(views) if calibrated is None else calibrated
     wide = [False] * len(views) if masks is None else masks
-    masses = [vessel_mass(*v, *known) for v, *known in zip(views, exact, wide, strict=True)]
+    fine = [None] * len(views) if grains is None else grains
+    masses = [
+        vessel_mass(*view, known, mask, grain)
+        for view, known, mask, grain in zip(views, exact, wide, fine, strict=True)
+    ]
     poses = {0: Pose()}
     while len(poses) < len(views):
         left = [k for k in range(len(views)) if k not in poses]
@@ -275,7 +284,9 @@ def _estimate(
     given = Pose(before=before, after=before, landmark_before_mm=gap, landmark_after_mm=gap)
     calibrated = fixed.calibrated and moving.calibrated
     apart = mismatch(fixed, moving, moving.carm, options.fine_mm)
-    if not options.enabled or (calibrated and gap is None and apart <= AGREED_CALIBRATED):
+    grain = sampling_noise(fixed, moving, moving.carm, options.fine_mm)
+    agreed = calibrated and gap is None and apart <= max(CALIBRATED_NOISE, AGREED_GRAIN * grain)
+    if agreed or not options.enabled:
         return given
     prior = prior_sigmas()
     root = prior_root(moving.carm)
