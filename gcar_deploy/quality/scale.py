@@ -25,8 +25,10 @@ from gcar_deploy.types import Array, Scalars
 
 #: a profile is followed so many radii, and at least so many pixels, to each side
 _REACH_RADII, _REACH_PX, _STEP_PX = 3.0, 5.0, 0.25
-#: variance that a pixel's square and the bilinear reading add, square pixels
-_BLUR_PX2 = 1 / 12 + 1 / 6
+#: variance that the bilinear reading adds, and a pixel's square where the picture holds means over
+#: it, square pixels; a picture of the paths at the pixels' middles is not blurred by the latter
+_READING_PX2, _SQUARE_PX2 = 1 / 6, 1 / 12
+_BLUR_PX2 = _READING_PX2 + _SQUARE_PX2
 #: a profile narrower than so many times the blur tells the blur
 _LEAST_VARIANCE = 2.0
 #: sine of the tilt below which a vessel runs along the ray
@@ -39,15 +41,16 @@ _TOLERANCE, _TOLERANCE_COARSE, _COARSE_MM = 1.2, 1.6, 0.8
 #: and below 1, where soft edges can look like it; set after a tree of soft voxels had been doubted
 _SHORT = 0.6
 #: Mean factors of all views, which cancel what lumens are wider than deep. Right pictures of
-#: generated trees, sharp or blurred by up to half a pixel, are at 0.927 .. 1.026 (``gcar_export``,
+#: generated trees, sharp or blurred by up to half a pixel, are at 0.927 .. 1.003 (``gcar_export``,
 #: ``studies.scale_lines``); above there is room for lumens that are not as round as theirs
-_MEAN = (0.925, 1.09)
+_MEAN = (0.925, 1.07)
 #: lower limit where a picture was enlarged: real trees' doubled by interpolation are at 0.91
 _MEAN_ENLARGED = 0.85
 #: from here on paths are too long for any vessel in a picture that is not coarse
 _REFUSED = 1.5
 #: Of the lines of a picture alone, on their median: right ones of real and generated trees are at
-#: 0.8 .. 1.0, and no course in space makes half of a tree's vessels three times as deep as wide
+#: 0.8 .. 1.0. A vessel along the ray is deeper than wide, but no course in space makes half of a
+#: tree's vessels three times as deep in all views; paths of one view alone add up to another sum
 _GROSS = 3.0
 #: thick vessels need so many times the section of thin ones to tell blur from scale
 _LEAST_RANGE = 2.0
@@ -70,6 +73,7 @@ def check_gross_scale(angiograms: Sequence[Angiogram], views: Sequence[VesselIma
     RefusedError
         Paths are several times what the width of the shadows allows.
     """
+    told = []
     for angiogram, view in zip(angiograms, views, strict=True):
         drawn = (angiogram.mask, angiogram.erased, angiogram.painted)
         if not view.calibrated or any(one is not None for one in drawn):
@@ -79,9 +83,10 @@ def check_gross_scale(angiograms: Sequence[Angiogram], views: Sequence[VesselIma
             continue
         half = cv2.distanceTransform(view.mask.astype(np.uint8), cv2.DIST_L2, 5)[line]
         width_mm = 2 * half * view.carm.pixel_at_isocenter_mm
-        factor = float(np.median(view.path_mm[line] / width_mm))
-        if factor > _GROSS:
-            raise RefusedError(_said(f"view {view.view_id}: path lengths are about", factor))
+        told.append((float(np.median(view.path_mm[line] / width_mm)), view.view_id))
+    factor, which = min(told, default=(0.0, ""))
+    if factor > _GROSS:
+        raise RefusedError(_said(f"view {which}: path lengths are about", factor))
 
 
 def _said(begins: str, factor: float, *, enlarged: bool = False) -> str:
@@ -160,11 +165,13 @@ def scale_factor(tree: Tree, view: VesselImage) -> float | None:
         _sections(line, path, least)
         for line, path in zip(lines, np.split(paths, sizes[:-1]), strict=True)
     ]
-    told, shown = np.concatenate(found, axis=1)
+    told, shown, square = np.concatenate(found, axis=1)
     if len(told) < _LEAST_PROFILES:
         return None
     plain = float(np.median(told / shown))
-    return plain if plain >= 1 else _without_blur(told, shown, plain)
+    # Nobody says which of both a pixel holds: paths are too long where they are so either way.
+    longer = max(1.0, float(np.median(told / (shown + square))))
+    return min(plain, longer) if plain >= 1 else _without_blur(told, shown, plain)
 
 
 def _without_blur(told: Scalars, shown: Scalars, plain: float) -> float | None:
@@ -229,13 +236,17 @@ def _profiles(tree: Tree, view: VesselImage) -> list[_Profiles]:
 
 
 def _sections(line: _Profiles, path_mm: Array, least_mm: float) -> Array:
-    """(2, k) variance, mm^2, of each shadow that stands alone: by its integral, by its shape."""
+    """(3, k) variance, mm^2, of each shadow that stands alone: by its integral, by its shape.
+
+    And what a pixel's square may have added to the latter, which is taken off.
+    """
     path = path_mm.reshape(line.pixels.shape[:2])
     area, variance, alone = _moments(np.where(path > least_mm, path, 0.0), line.x_px)
     good = alone & (variance > _LEAST_VARIANCE * _BLUR_PX2)
     told = area * line.sine * line.size_mm / (4 * np.pi)
     shown = (variance - _BLUR_PX2) * line.size_mm**2
-    return np.stack([told[good], shown[good]])
+    square = _SQUARE_PX2 * line.size_mm**2
+    return np.stack([told[good], shown[good], square[good]])
 
 
 def _moments(path: Array, x: Scalars) -> tuple[Scalars, Scalars, Array]:

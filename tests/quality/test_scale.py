@@ -182,6 +182,39 @@ def test_a_scale_that_is_far_off_is_refused_on_the_pictures_own_lines():
     check_gross_scale([given], [dataclasses.replace(views[4.0], path_error=0.3)])
 
 
+def test_a_vessel_along_the_beam_of_one_view_is_no_wrong_scale():
+    """Its path is far longer than it is wide in that view alone; a wrong scale is so in all."""
+    along = np.asarray(CARM.axes[2]) + 0.2 * np.asarray(CARM.axes[1])
+    tree, other = tube(along, radius=1.2), dataclasses.replace(CARM, primary_angle_deg=55)
+    given = Angiogram(
+        view_id="1", carm=CARM, pixels=np.zeros((512, 512), np.float32), bit_depth=16, sha256="1",
+        intensity=Intensity(kind="path_length", mm_per_count=0.001),
+    )  # fmt: skip
+
+    def views(factor):
+        seen = [picture(tree, carm, factor) for carm in (CARM, other)]
+        return [dataclasses.replace(v, skeleton=skeletonize(v.mask)) for v in seen]
+
+    with pytest.raises(RefusedError):
+        check_gross_scale([given], views(1.0)[:1])
+    check_gross_scale([given] * 2, views(1.0))
+    with pytest.raises(RefusedError):
+        check_gross_scale([given] * 2, views(4.0))
+
+
+@pytest.mark.parametrize("radius", [0.9, 1.2, 1.8])
+def test_paths_at_the_middles_of_wide_pixels_are_not_too_long(radius):
+    carms = [
+        dataclasses.replace(CARM, pixel_spacing_mm=(0.78, 0.78), rows=256, columns=256,
+                            primary_angle_deg=angle)
+        for angle in (-30, 45)
+    ]  # fmt: skip
+    tree = tube((0.3, 0.5, 1.0), radius)
+    for factor, doubted in ((1.0, False), (1.25, True)):
+        found = check_scale(tree, [picture(tree, carm, factor) for carm in carms])
+        assert bool(found) is doubted, found
+
+
 def test_a_scale_that_is_far_off_costs_no_fit_and_validate_knows_it(monkeypatch):
     def refine(*_, **__):
         raise AssertionError("fitted")
