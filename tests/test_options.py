@@ -102,7 +102,7 @@ def test_the_message_names_option_value_and_range(path, value, said, tmp_path):
     assert inspect_files([tmp_path / "a", tmp_path / "b"], None, options).error.exit_code == 2
 
 
-@pytest.mark.parametrize("value", [0, -1, 257, 2.5, math.nan, math.inf, "2", True, [1]])
+@pytest.mark.parametrize("value", [0, -1, 257, 10**400, 2.5, math.nan, math.inf, "2", True, [1]])
 def test_threads_and_deadline(value):
     with pytest.raises(UsageError, match=r"^threads = .* must be a whole number, 1 \.\. 256$"):
         Engine(options=HULL, threads=value)

@@ -124,10 +124,17 @@ def check_number(key: str, value: Any, hint: type, rule: Range | None) -> None:
         (numbers.Integral, "a whole number") if hint is int else (numbers.Real, "a number")
     )
     what = f"{words}, {dataclasses.replace(rule, many=0)}" if rule else words
-    if not isinstance(value, kind) or isinstance(value, bool) or not math.isfinite(value):
+    if not isinstance(value, kind) or isinstance(value, bool) or not _finite(value):
         raise _refusal(key, value, what)
     if rule is not None and not rule.least <= float(value) <= rule.most:
         raise _refusal(key, value, what)
+
+
+def _finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        return False
 
 
 def check_choice(key: str, value: Any, known: tuple[str, ...]) -> None:

@@ -23,7 +23,7 @@ class Segment:
     branch : number of the branch, from 0
     role : ``parent``, ``main`` (the wider daughter by reference) or ``side``
     reference_mm : reference diameter at the node
-    minimal_diameter_mm, stenosis_percent : at the worst of its sections
+    minimal_diameter_mm, stenosis_percent : at the worst of its sections, by the reference there
     """
 
     branch: int

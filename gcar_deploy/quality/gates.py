@@ -382,7 +382,8 @@ def check_tree(tree: Tree, options: QualityOptions, confidence: Scalars | None =
         if confidence is not None and np.max(confidence, initial=0.0) < LEAST_FOUND:
             raise RefusedError(
                 "the model finds no vessel (largest confidence "
-                f"{np.max(confidence, initial=0.0):.2f} of 1); is it trained?"
+                f"{np.max(confidence, initial=0.0):.2f} of 1): do the views show one tree, "
+                "or is the model trained too little?"
             )
         raise RefusedError(
             f"only {tree.length_mm:.0f} mm of vessel are seen by all views "
