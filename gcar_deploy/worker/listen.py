@@ -118,7 +118,9 @@ class Listener:
             self._server.shutdown()
         with self._lock:
             studies, self._studies = self._studies, {}
-        for study in studies.values():
+        for uid, study in studies.items():
+            if study.runs:
+                self._say(f"study {uid}: {len(study.runs)} of {self._wanted} runs, dropped")
             drop_scratch(study.scratch)
 
     def _store(self, event: Any) -> int:

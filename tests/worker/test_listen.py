@@ -113,6 +113,19 @@ def test_runs_that_come_one_by_one_and_a_folder_that_exists(listening, runs, sai
     ]  # fmt: skip
 
 
+def test_what_waits_when_it_ends_is_said_to_be_dropped(runs, said, tmp_path):
+    queue = JobQueue(lambda *_: None)
+    listener = Listener(queue, tmp_path, title="GCAR", most_mib=1, say=said.append)
+    study, (file, _) = runs
+    link = associate(listener.start(0))
+    assert link.send_c_store(pydicom.dcmread(file)).Status == 0
+    link.release()
+    listener.stop()
+    queue.close()
+    assert said[-1] == f"study {study}: 1 of 2 runs, dropped"
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_a_study_waits_for_its_own_sender(listening, runs):
     port, orders, _, queue = listening
