@@ -145,7 +145,7 @@ def _fitted(start: TubeFit, views: Sequence[VesselImage], run: Run) -> TubeFit:
     own = all(t.path_mm.shape == v.path_mm.shape for t, v in zip(targets, views, strict=True))
     return dataclasses.replace(
         start,
-        tree=with_sigma(now, targets, options),
+        tree=with_sigma(now, targets, options, run.should_stop),
         contrast=tuple(target.contrast for target in targets),
         model_mm=tuple(
             seen.image(target.path_mm.shape)
@@ -203,7 +203,10 @@ def _supported(now: State, targets: list[Target]) -> Tree:
     return grown_tree(tree, targets, left)
 
 
-def with_sigma(now: State, targets: list[Target], options: TubeOptions) -> Tree:
+def with_sigma(
+    now: State, targets: list[Target], options: TubeOptions,
+    should_stop: Callable[[], bool] | None = None,
+) -> Tree:  # fmt: skip
     """Return the tree with covariance and sigma per point."""
     tree, tubes = now.tree, now.tubes
     views = [
@@ -211,7 +214,7 @@ def with_sigma(now: State, targets: list[Target], options: TubeOptions) -> Tree:
         for target, seen in zip(targets, now.prints, strict=True)
     ]
     tangents = np.concatenate([branch.tangents for branch in tree.branches])
-    parts = spread(tubes, tangents, views, now.prior)
+    parts = spread(tubes, tangents, views, now.prior, should_stop)
     covariance = np.stack([parts.fit, parts.geometry], axis=1)
     sigma = worst_sigma(parts.fit + parts.geometry)
     branches = []

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import sparse
@@ -39,6 +39,10 @@ TOGETHER = 4
 #: a starting point errs as its neighbours do, and moves with the geometry it was found in: the
 #: starting points hold so many times less than the fit lets them
 SHARED_STARTS = 100.0
+#: a Hessian of more entries takes minutes to factorise and to solve, in calls that nothing ends:
+#: vessels that share rays, but no fork, then count as known to each other. Of a tree of 60 branches
+#: sigma is 0.93 to 1.17 times as large then, the median 1.00 in two views and 1.04 in four
+MOST_ENTRIES = 2_000_000
 #: error of a tube between the pixels, as a share of the coarsest pixel at the isocentre
 PIXEL_SHARE = 0.15
 #: step of the first differences by a view's place, mm and degrees
@@ -60,7 +64,10 @@ class Spread:
     geometry: Array
 
 
-def spread(tubes: Tubes, tangents: Points, views: Sequence[Seen], prior: Prior) -> Spread:
+def spread(
+    tubes: Tubes, tangents: Points, views: Sequence[Seen], prior: Prior,
+    should_stop: Callable[[], bool] | None = None,
+) -> Spread:  # fmt: skip
     """Work out both parts of the covariance of every branch point.
 
     Parameters
@@ -69,6 +76,8 @@ def spread(tubes: Tubes, tangents: Points, views: Sequence[Seen], prior: Prior) 
     tangents : (n, 3) unit vector along the vessel at each branch point
     views : what each view says of them
     prior : Prior of the fit
+    should_stop : asked on the way: where it raises, that ends it; what is late is not waited for
+        longer than it must be
 
     Raises
     ------
@@ -78,15 +87,34 @@ def spread(tubes: Tubes, tangents: Points, views: Sequence[Seen], prior: Prior) 
     n = len(tubes.owner)
     if not n:
         return Spread(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
-    factor = _factorised(sum(view.hessian() for view in views), prior)
+    late = should_stop is not None and should_stop()
+    hessian = sum(view.hessian() for view in views)
+    if late or hessian.nnz > MOST_ENTRIES:
+        hessian = _within_branches(hessian, tubes)
+    factor = _factorised(hessian, prior)
     ends = np.flatnonzero(np.diff(tubes.point_branch, prepend=-1, append=-1))
     places = np.unique(np.concatenate([np.arange(0, n, EVERY), ends[:-1], ends[1:] - 1]))
     row = 3 * tubes.owner[places][:, None] + np.arange(3)
-    parts = [_fit(factor, row), _geometry(factor, row, tubes, views)]
+    parts = [_fit(factor, row, should_stop), _geometry(factor, row, tubes, views)]
     across = np.eye(3) - tangents[:, :, None] * tangents[:, None, :]
     coarsest = max(view.carm.pixel_at_isocenter_mm for view in views)
     parts[0] = parts[0] + (PIXEL_SHARE * coarsest) ** 2 * np.eye(3)
     return Spread(*(across @ _between(part, places, n) @ across for part in parts))
+
+
+def _within_branches(hessian: sparse.csc_matrix, tubes: Tubes) -> sparse.csc_matrix:
+    """Leave out what couples branches otherwise than by the node where they meet."""
+    count = len(tubes.positions_mm)
+    first, last = np.full(count, len(tubes.owner)), np.full(count, -1)
+    np.minimum.at(first, tubes.owner, tubes.point_branch)
+    np.maximum.at(last, tubes.owner, tubes.point_branch)
+    # Three coordinates of every position, then the radius of every point; -1 is every branch's.
+    of = np.concatenate([np.repeat(np.where(first == last, first, -1), 3), tubes.point_branch])
+    whole = hessian.tocoo()
+    row, column = of[whole.row], of[whole.col]
+    keep = (row == column) | (row < 0) | (column < 0)
+    kept = whole.data[keep], (whole.row[keep], whole.col[keep])
+    return sparse.csc_matrix(kept, shape=hessian.shape)
 
 
 def _factorised(hessian: sparse.csc_matrix, prior: Prior) -> SuperLU:
@@ -103,20 +131,23 @@ def _factorised(hessian: sparse.csc_matrix, prior: Prior) -> SuperLU:
     return factor
 
 
-def _fit(factor: SuperLU, row: Array) -> Array:
+def _fit(factor: SuperLU, row: Array, should_stop: Callable[[], bool] | None) -> Array:
     """(k, 3, 3) blocks of the inverse at (k, 3) rows."""
     rows, back = np.unique(row, return_inverse=True)
     back = back.reshape(row.shape)
     parts = [rows[start : start + TOGETHER] for start in range(0, len(rows), TOGETHER)]
     solved = np.concatenate(
-        side_by_side([functools.partial(_columns, factor, part) for part in parts]), axis=1
+        side_by_side([functools.partial(_columns, factor, part, should_stop) for part in parts]),
+        axis=1,
     )
     out: Array = solved[row[:, :, None], back[:, None, :]]
     return 0.5 * (out + np.swapaxes(out, 1, 2))
 
 
-def _columns(factor: SuperLU, rows: Array) -> Array:
+def _columns(factor: SuperLU, rows: Array, should_stop: Callable[[], bool] | None) -> Array:
     """(unknowns, m) columns of the inverse."""
+    if should_stop is not None:
+        should_stop()  # Whoever cancelled raises here.
     unit = np.zeros((factor.shape[0], len(rows)), order="F")
     unit[rows, np.arange(len(rows))] = 1.0
     out: Array = factor.solve(unit)

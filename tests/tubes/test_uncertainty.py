@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gcar_deploy.config import TubeOptions
+from gcar_deploy.errors import CancelledError
 from gcar_deploy.geometry.covariance import worst_sigma
 from gcar_deploy.geometry.prior import LEFT_DEG, LEFT_MM
 from gcar_deploy.tree.tree import Tree
+from gcar_deploy.tubes import uncertainty
 from gcar_deploy.tubes.fit import fit_tubes
 from gcar_deploy.tubes.gauss_newton import footprints, normal_equations
 from gcar_deploy.tubes.hessian import LEAST_MISFIT, PATCH_MM2, seen_by
@@ -230,3 +232,37 @@ def _along_depth(points, dense, covariance, fitted, told):
     axis = axis / size[:, None]
     spread_ = np.sqrt(np.einsum("ni,nij,nj->n", axis, covariance, axis))
     return (np.einsum("ni,ni->n", off, axis) / spread_)[size > 0.7]
+
+
+def test_a_large_scene_counts_vessels_that_share_rays_as_known(monkeypatch):
+    """What meets at a fork stays coupled; the rest of the couplings hardly counts."""
+    truth = seven()
+    targets = make_targets(seen(truth, two_views(128, 1.2)), 0.0, OPTIONS)
+    tubes = tubes_of(truth)
+    prior = make_prior(tubes, np.ones(len(tubes.log_radius)), OPTIONS)
+    told = [
+        seen_by(tubes, target, print_, OPTIONS)
+        for target, print_ in zip(targets, footprints(tubes, targets), strict=True)
+    ]
+    along = np.concatenate([one.tangents for one in truth.branches])
+    whole = spread(tubes, along, told, prior)
+    monkeypatch.setattr(uncertainty, "MOST_ENTRIES", 0)
+    within = spread(tubes, along, told, prior)
+    assert (within.fit != whole.fit).any()
+    ratio = worst_sigma(within.fit) / worst_sigma(whole.fit)
+    assert 0.95 < np.median(ratio) < 1.05 and np.quantile(ratio, 0.05) > 0.8
+    # One that is late is not waited for, one that is cancelled ends within.
+    monkeypatch.undo()
+    late = spread(tubes, along, told, prior, lambda: True)
+    np.testing.assert_array_equal(late.fit, within.fit)
+    asked = []
+
+    def cancelled():
+        asked.append(1)
+        if len(asked) > 3:
+            raise CancelledError("enough")
+        return False
+
+    with pytest.raises(CancelledError):
+        spread(tubes, along, told, prior, cancelled)
+    assert len(asked) == 4
