@@ -41,9 +41,10 @@ class _Group(click.Group):
         except (click.ClickException, click.Abort, click.exceptions.Exit):
             raise
         except ImportError as error:
-            need = f"{error.name} is missing; pip install 'gcar[export]'"
+            package = str(error.name).partition(".")[0]
+            need = f"{package} is missing; pip install 'gcar[export]'"
             click.echo(f"gcar-export: error: {need}", err=True)
-            sys.exit(1)
+            sys.exit(UsageError.exit_code)
         except Exception as error:
             logging.getLogger("gcar_export").info("internal error", exc_info=True)
             click.echo(f"gcar-export: error: {_said(error)}", err=True)

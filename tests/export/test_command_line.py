@@ -1,6 +1,8 @@
 """What the workshop's commands refuse before they work: numbers, places to write to."""
 
 import re
+import subprocess
+import sys
 
 import pytest
 from click.testing import CliRunner
@@ -121,3 +123,21 @@ def test_what_ends_a_verb_is_one_line_and_its_exit_code(tmp_path, monkeypatch, e
     monkeypatch.setattr("gcar_export.training.train.start", fail)
     ended, output = said("train", "--out", tmp_path / "run")
     assert (ended, output.strip()) == (code, line)
+
+
+@pytest.mark.parametrize("library", ["torch", "nibabel"])
+def test_a_missing_extra_is_one_line(library, tmp_path):
+    (tmp_path / "label.nii.gz").touch()
+    words = ["train", "--out", "run"] if library == "torch" else ["simulate", "label.nii.gz", "out"]
+    code = (
+        f"import sys; sys.modules[{library!r}] = None\n"
+        f"from gcar_export.cli.main import main; main({words!r})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr == (
+        f"gcar-export: error: {library} is missing; pip install 'gcar[export]'\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["label.nii.gz"]
