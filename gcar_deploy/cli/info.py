@@ -33,7 +33,7 @@ def info(path: Path, as_json: bool) -> None:
         model = read_model(path, (*PREDICTOR_KINDS.values(), SEGMENTER))
         click.echo(json.dumps(model.spec) if as_json else "\n".join(model_card(model)))
         return
-    from gcar_deploy.output.stored import read_summary
+    from gcar_deploy.output.stored import altered_files, read_summary
 
     summary = read_summary(path)
     altered = altered_files(path, summary)
@@ -43,22 +43,6 @@ def info(path: Path, as_json: bool) -> None:
         click.echo("\n".join(lines(path, summary)))
     if altered:
         raise ToldError(UsageError(f"{path}: not as it was written: {', '.join(altered)}"))
-
-
-def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:
-    """Names of the listed files that are missing or have another SHA-256."""
-    import hashlib
-
-    from gcar_deploy.files import is_file, is_folder
-
-    if not is_folder(folder):
-        return []
-    out = []
-    for name, entry in summary.get("files", {}).items():
-        file = folder / Path(name).name
-        if not is_file(file) or hashlib.sha256(file.read_bytes()).hexdigest() != entry["sha256"]:
-            out.append(name)
-    return out
 
 
 def names_of(branches: list[dict[str, Any]]) -> str:

@@ -28,10 +28,12 @@ def slicer(result: Path, out: Path | None, force: bool) -> None:
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
     from gcar_deploy.files import is_there
-    from gcar_deploy.output.slicer_scene import slicer_scene
-    from gcar_deploy.output.stored import read_summary
+    from gcar_deploy.output.slicer_scene import FILES, slicer_scene
+    from gcar_deploy.output.stored import read_listed, read_summary
 
-    read_summary(result / "result.json")
+    summary = read_summary(result / "result.json")
+    for name in FILES:
+        read_listed(result, name, summary)
     folder = result.resolve()
     out = folder.with_name(f"{folder.name}.mrml") if out is None else out.resolve()
     if out.suffix != ".mrml":

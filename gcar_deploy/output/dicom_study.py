@@ -13,10 +13,12 @@ import io
 import itertools
 import warnings
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pydicom
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import (
@@ -32,7 +34,7 @@ from gcar_deploy.dicom.header import PATIENT, told_apart
 from gcar_deploy.errors import GcarError, ImageError, UsageError
 from gcar_deploy.output.dicom_sr import measurement_report
 from gcar_deploy.output.dicom_stl import dicom_stl, equipment
-from gcar_deploy.output.stored import read_folder
+from gcar_deploy.output.stored import read_folder, read_listed
 
 #: which study and which picture it is
 _UIDS = ("StudyInstanceUID", "SeriesInstanceUID", "SOPClassUID", "SOPInstanceUID")
@@ -42,6 +44,7 @@ _EMPTY = (
     "PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyDate", "StudyTime",
     "ReferringPhysicianName", "StudyID", "AccessionNumber",
 )  # fmt: skip
+_OVERLAY_FILES = "overlay_view*.png"
 _OVERLAYS = "Coronary tree over the X-ray pictures, research use only"
 _PAGE = "Coronary report, research use only"
 
@@ -63,8 +66,8 @@ def study_objects(folder: Path, runs: Sequence[Path], pdf: Path | None = None) -
     Raises
     ------
     GcarError
-        A file cannot be read, the result was not made from these runs, they are of several
-        studies, highdicom is missing, or it takes a value amiss.
+        A file cannot be read or is not as it was written, the result was not made from these
+        runs, they are of several studies, highdicom is missing, or it takes a value amiss.
     """
     try:
         with warnings.catch_warnings(action="ignore"):
@@ -90,12 +93,15 @@ def _objects(folder: Path, runs: Sequence[Path], pdf: Path | None) -> dict[str, 
             )
     study = headers[0]
     try:
-        surface = dicom_stl((folder / "surface.stl").read_bytes(), [str(study.StudyInstanceUID)])
-        overlays = sorted(folder.glob("overlay_view*.png"))
+        mesh = read_listed(folder, "surface.stl", stored.summary)
+        surface = dicom_stl(mesh, [str(study.StudyInstanceUID)])
+        # Those that result.json lists: what else lies in the folder may be of another patient.
+        overlays = sorted(n for n in stored.summary["files"] if fnmatchcase(n, _OVERLAY_FILES))
         series = generate_uid()
         made = {"surface.dcm": surface}
-        for k, path in enumerate(overlays, start=1):
-            made[f"{path.stem}.dcm"] = _capture(path, k, series)
+        for k, name in enumerate(overlays, start=1):
+            picture = read_listed(folder, name, stored.summary)
+            made[f"{Path(name).stem}.dcm"] = _capture(name, picture, k, series)
         if pdf is not None:
             made["page.dcm"] = _page(pdf)
     except OSError as error:
@@ -185,11 +191,11 @@ def _new(kind: UID, modality: str, series: str, number: int) -> Any:
     return data
 
 
-def _capture(path: Path, number: int, series: str) -> Any:
+def _capture(name: str, png: bytes, number: int, series: str) -> Any:
     """Secondary Capture of one PNG, red green blue."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise GcarError(f"{path.name} cannot be read back")
+        raise GcarError(f"{name} cannot be read back")
     data = _new(SecondaryCaptureImageStorage, "OT", series, 2)
     # An unpaired body part has no laterality, what a screen shows no orientation.
     data.BodyPartExamined, data.PatientOrientation = "HEART", ""

@@ -18,6 +18,8 @@ _GREY = "vtkMRMLColorTableNodeGrey"
 #: a colour of its own for every whole number: the branches
 _BY_NUMBER = "vtkMRMLProceduralColorNodeRandomIntegers"
 
+#: what a scene names of the folder
+FILES = VOLUME, SURFACE, CENTERLINE = "volume.nii.gz", "surface.stl", "centerline.vtp"
 #: signs of a file name that Slicer decodes, and no others
 _ENCODED = str.maketrans({sign: f"%{ord(sign):02X}" for sign in " %'\"<>"})
 
@@ -35,17 +37,17 @@ def slicer_scene(folder: Path, scene: Path) -> str:
             "colorNodeID": _GREY, "window": "1", "level": "0.5", "autoWindowLevel": "0",
             "interpolate": "1", "visibility": "true",
         }),
-        _stored("VolumeArchetypeStorage", 1, folder / "volume.nii.gz", scene,
+        _stored("VolumeArchetypeStorage", 1, folder / VOLUME, scene,
                 {"UseOrientationFromFile": "1"}),
         _node("Volume", "vtkMRMLScalarVolumeNode1", f"{folder.name} occupancy", {
             "references": "display:vtkMRMLScalarVolumeDisplayNode1;"
                           "storage:vtkMRMLVolumeArchetypeStorageNode1;",
         }),
-        *_model(1, folder / "surface.stl", scene, f"{folder.name} lumen", {
+        *_model(1, folder / SURFACE, scene, f"{folder.name} lumen", {
             "color": "0.84 0.37 0", "opacity": "0.45", "visibility2D": "true",
             "scalarVisibility": "false",
         }),
-        *_model(2, folder / "centerline.vtp", scene, f"{folder.name} centreline", {
+        *_model(2, folder / CENTERLINE, scene, f"{folder.name} centreline", {
             "color": "1 1 1", "opacity": "1", "lineWidth": "4", "scalarVisibility": "true",
             "activeScalarName": "BranchId", "activeAttributeLocation": "cell",
             "scalarRangeFlag": "UseColorNode", "colorNodeID": _BY_NUMBER,

@@ -14,13 +14,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gcar_deploy.errors import UsageError
-from gcar_deploy.files import is_folder, read_bounded
+from gcar_deploy.files import is_file, is_folder, read_bounded
 from gcar_deploy.measure import Sections
 from gcar_deploy.output.tables import SECTION_COLUMNS
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array
 
-_MOST_BYTES = 2**26
+_MOST_BYTES, _MOST_LISTED_BYTES = 2**26, 2**30
 _Parsed = TypeVar("_Parsed")
 _COLUMNS = ("branch", "x_mm", "y_mm", "z_mm", "radius_mm", "sigma_mm", "confidence")
 
@@ -66,17 +66,42 @@ def _parsed(
     parse: Callable[[str, list[dict[str, Any]]], _Parsed],
 ) -> _Parsed:
     """Table of a folder, if it is as it was written and fits ``result.json``."""
-    try:
-        data = read_bounded(folder / name, _MOST_BYTES)
-    except ValueError as error:
-        raise UsageError(f"{folder / name} {error}") from None
-    listed = summary.get("files", {}).get(name, {})
-    if hashlib.sha256(data).hexdigest() != listed.get("sha256"):
-        raise UsageError(f"{folder / name} is not as it was written; run gcar again")
+    data = read_listed(folder, name, summary)
     try:
         return parse(data.decode("ascii"), summary["tree"]["branches"])
     except (KeyError, ValueError, TypeError, IndexError):
         raise UsageError(f"{folder}: {name} and result.json do not fit together") from None
+
+
+def read_listed(folder: Path, name: str, summary: dict[str, Any]) -> bytes:
+    """Bytes of a file of a result folder, if they are those that were written.
+
+    Raises
+    ------
+    UsageError
+        It is missing, or another one than ``summary`` lists.
+    """
+    file = folder / Path(name).name
+    try:
+        data = read_bounded(file, _MOST_LISTED_BYTES)
+    except ValueError as error:
+        raise UsageError(f"{file} {error}") from None
+    listed = summary.get("files", {}).get(name, {})
+    if hashlib.sha256(data).hexdigest() != listed.get("sha256"):
+        raise UsageError(f"{file} is not as it was written; run gcar again")
+    return data
+
+
+def altered_files(folder: Path, summary: dict[str, Any]) -> list[str]:
+    """Names of the listed files that are missing or have another SHA-256."""
+    if not is_folder(folder):
+        return []
+    out = []
+    for name, entry in summary.get("files", {}).items():
+        file = folder / Path(name).name
+        if not is_file(file) or hashlib.sha256(file.read_bytes()).hexdigest() != entry["sha256"]:
+            out.append(name)
+    return out
 
 
 def read_summary(path: Path) -> dict[str, Any]:

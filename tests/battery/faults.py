@@ -21,8 +21,7 @@ from pathlib import Path
 
 import click
 
-from gcar_deploy.cli.info import altered_files
-from gcar_deploy.output.stored import read_summary
+from gcar_deploy.output.stored import altered_files, read_summary
 from tests.battery.cases import write_case
 
 _ROOT = Path(__file__).parents[2]

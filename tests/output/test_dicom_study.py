@@ -210,6 +210,27 @@ def test_nobody_elses_study_gets_the_result(result, jane, tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+def test_what_is_not_as_it_was_written_is_not_filed(result, jane, tmp_path):
+    """Another case's surface or picture would go to this patient's archive."""
+    made = result_of(named(tmp_path, side=240)[1], tmp_path / "other")
+    for name in ("surface.stl", "overlay_view1.png"):
+        for number, other in enumerate((made / name, None)):
+            folder = shutil.copytree(result, tmp_path / f"{name}{number}")
+            (folder / name).unlink()
+            if other is not None:
+                shutil.copy(other, folder / name)
+            done = gcar("dicom", folder, *jane, "--out", tmp_path / "o")
+            told = "is not as it was written" if other is not None else "no such file"
+            assert done.code == 2 and f"{folder / name} {told}" in done.err
+            assert done.err.count("\n") == 1 and not (tmp_path / "o").exists()
+
+
+def test_a_picture_that_is_not_listed_is_not_filed(result, jane, tmp_path):
+    folder = shutil.copytree(result, tmp_path / "result")
+    shutil.copy(folder / "overlay_view1.png", folder / "overlay_view3.png")
+    assert "overlay_view3.dcm" not in study_objects(folder, jane)
+
+
 def test_captures_hold_the_overlays_pixels(result, jane):
     import cv2
 

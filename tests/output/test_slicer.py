@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 from urllib.parse import unquote
@@ -96,6 +97,18 @@ def test_nothing_is_overwritten_unasked(scene, tmp_path):
     told = [tmp_path / unquote(name) for name in names if name]
     assert len(told) == 3 and all(path.is_file() for path in told)
     assert gcar("slicer", tmp_path).code == 2
+
+
+@pytest.mark.parametrize("name", ["volume.nii.gz", "surface.stl", "centerline.vtp"])
+def test_a_file_that_is_not_as_it_was_written_is_refused(scene, tmp_path, name):
+    folder = shutil.copytree(scene[1], tmp_path / "result")
+    (folder / name).write_bytes(b"abc")
+    done = gcar("slicer", folder)
+    assert done.code == 2 and f"{name} is not as it was written" in done.err
+    (folder / name).unlink()
+    done = gcar("slicer", folder)
+    assert done.code == 2 and f"{name} no such file" in done.err
+    assert not (tmp_path / "result.mrml").exists()
 
 
 @pytest.mark.skipif(SLICER_PYTHON is None, reason="GCAR_SLICER_PYTHON names no Python with slicer")
