@@ -39,7 +39,7 @@ def from_dicom(order: Order, out_file: Path | None) -> None:
     from gcar_deploy.config import RunOptions
     from gcar_deploy.dicom.scene import read_views
     from gcar_deploy.errors import UsageError
-    from gcar_deploy.files import is_there
+    from gcar_deploy.files import is_there, whole_file
     from gcar_deploy.geometry.scene import scene_to_json
 
     if len(order.views) < 2:
@@ -53,7 +53,8 @@ def from_dicom(order: Order, out_file: Path | None) -> None:
         click.echo(scene_to_json(scene), nl=False)
         return
     try:
-        out_file.write_text(scene_to_json(scene), encoding="utf-8")
+        with whole_file(out_file) as partial:
+            partial.write_text(scene_to_json(scene), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{out_file} cannot be written ({error.strerror})") from None
     click.echo(str(out_file))

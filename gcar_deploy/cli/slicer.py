@@ -27,7 +27,7 @@ def slicer(result: Path, out: Path | None, force: bool) -> None:
       Slicer result.mrml
     """  # noqa: D301 - click wants a real backspace
     from gcar_deploy.errors import UsageError
-    from gcar_deploy.files import is_there
+    from gcar_deploy.files import is_there, whole_file
     from gcar_deploy.output.slicer_scene import FILES, slicer_scene
     from gcar_deploy.output.stored import read_listed, read_summary
 
@@ -41,7 +41,8 @@ def slicer(result: Path, out: Path | None, force: bool) -> None:
     if is_there(out) and not force:
         raise UsageError(f"{out} exists; add --force to replace it")
     try:
-        out.write_text(slicer_scene(folder, out), encoding="utf-8")
+        with whole_file(out) as partial:
+            partial.write_text(slicer_scene(folder, out), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{out} cannot be written ({error.strerror})") from None
     click.echo(str(out))

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("pydicom", reason="needs the dicom extra")
 
 from gcar_deploy.selftest import tiny_case
-from tests.cli.conftest import gcar
+from tests.cli.conftest import full_disk, gcar
 from tests.dicom.files import tiny_runs
 
 
@@ -73,6 +73,14 @@ def test_a_geometry_is_written_to_a_new_file(runs, tmp_path):
     assert "new file" in gcar(*pair, "--out", file).err
     lost = gcar(*pair, "--out", tmp_path / "absent" / "geom.json")
     assert lost.code == 2 and lost.err.startswith("gcar: error: ") and lost.out == ""
+
+
+def test_a_full_disk_leaves_no_half_geometry(runs, tmp_path):
+    with full_disk():
+        done = gcar("geometry", "from-dicom", runs / "run1.dcm", runs / "run2.dcm",
+                    "--out", tmp_path / "geom.json")  # fmt: skip
+    assert done.code == 2 and "geom.json cannot be written" in done.err
+    assert not list(tmp_path.iterdir())
 
 
 def test_enhance(runs, tmp_path):

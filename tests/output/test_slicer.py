@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from tests.cli.conftest import gcar
+from tests.cli.conftest import full_disk, gcar
 
 #: a Python with slicer-core, which wants a vtk of its own
 SLICER_PYTHON = os.environ.get("GCAR_SLICER_PYTHON")
@@ -97,6 +97,15 @@ def test_nothing_is_overwritten_unasked(scene, tmp_path):
     told = [tmp_path / unquote(name) for name in names if name]
     assert len(told) == 3 and all(path.is_file() for path in told)
     assert gcar("slicer", tmp_path).code == 2
+
+
+def test_a_full_disk_leaves_the_scene_that_was_there(scene, tmp_path):
+    file = tmp_path / "s.mrml"
+    file.write_text("old")
+    with full_disk():
+        done = gcar("slicer", scene[1], "--out", file, "--force")
+    assert done.code == 2 and "cannot be written" in done.err
+    assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.parametrize("name", ["volume.nii.gz", "surface.stl", "centerline.vtp"])
