@@ -92,21 +92,17 @@ def _objects(folder: Path, runs: Sequence[Path], pdf: Path | None) -> dict[str, 
                 f"the runs tell of different patients ({keyword}): the result belongs to neither"
             )
     study = headers[0]
-    try:
-        mesh = read_listed(folder, "surface.stl", stored.summary)
-        surface = dicom_stl(mesh, [str(study.StudyInstanceUID)])
-        # Those that result.json lists: what else lies in the folder may be of another patient.
-        overlays = sorted(n for n in stored.summary["files"] if fnmatchcase(n, _OVERLAY_FILES))
-        series = generate_uid()
-        made = {"surface.dcm": surface}
-        for k, name in enumerate(overlays, start=1):
-            picture = read_listed(folder, name, stored.summary)
-            made[f"{Path(name).stem}.dcm"] = _capture(name, picture, k, series)
-        if pdf is not None:
-            made["page.dcm"] = _page(pdf)
-    except OSError as error:
-        lost = Path(error.filename or "a file").name
-        raise GcarError(f"{lost} cannot be read ({error.strerror})") from None
+    mesh = read_listed(folder, "surface.stl", stored.summary)
+    surface = dicom_stl(mesh, [str(study.StudyInstanceUID)])
+    # Those that result.json lists: what else lies in the folder may be of another patient.
+    overlays = sorted(n for n in stored.summary["files"] if fnmatchcase(n, _OVERLAY_FILES))
+    series = generate_uid()
+    made = {"surface.dcm": surface}
+    for k, name in enumerate(overlays, start=1):
+        picture = read_listed(folder, name, stored.summary)
+        made[f"{Path(name).stem}.dcm"] = _capture(name, picture, k, series)
+    if pdf is not None:
+        made["page.dcm"] = _page(pdf)
     for data in made.values():
         for keyword in ("SpecificCharacterSet", "StudyInstanceUID", "StudyDescription", *_EMPTY):
             if keyword in study:
@@ -210,9 +206,12 @@ def _capture(name: str, png: bytes, number: int, series: str) -> Any:
 
 def _page(path: Path) -> Any:
     """Wrap a printed page as Encapsulated PDF."""
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path.name} cannot be read ({error.strerror})") from None
     if not content.startswith(b"%PDF-"):
-        raise GcarError(f"{path.name} is no PDF")
+        raise UsageError(f"{path.name} is no PDF")
     data = _new(EncapsulatedPDFStorage, "DOC", generate_uid(), 4)
     data.SeriesDescription = data.DocumentTitle = _PAGE
     # The page bears the name of its case, which may be a person's.

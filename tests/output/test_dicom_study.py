@@ -21,7 +21,7 @@ import pydicom
 from pydicom.sr.codedict import codes
 from pydicom.uid import generate_uid
 
-from gcar_deploy.errors import GcarError, UsageError
+from gcar_deploy.errors import UsageError
 from gcar_deploy.output.dicom_sr import measurement_report
 from gcar_deploy.output.dicom_study import _EMPTY, file_bytes, study_objects
 from gcar_deploy.output.stored import read_folder
@@ -201,9 +201,9 @@ def test_nobody_elses_study_gets_the_result(result, jane, tmp_path):
     with pytest.raises(UsageError, match="1 runs: the result has 2"):
         study_objects(result, jane[:1])
     (tmp_path / "x.pdf").write_bytes(b"PDF")
-    with pytest.raises(GcarError, match=r"^x\.pdf is no PDF"):
+    with pytest.raises(UsageError, match=r"^x\.pdf is no PDF"):
         study_objects(result, jane, tmp_path / "x.pdf")
-    with pytest.raises(GcarError, match=r"^none\.pdf cannot be read"):
+    with pytest.raises(UsageError, match=r"^none\.pdf cannot be read"):
         study_objects(result, jane, tmp_path / "none.pdf")
     done = gcar("dicom", result, tmp_path / "none.dcm", jane[0], "--out", tmp_path / "o")
     assert done.code == 3 and "error: none.dcm cannot be read as DICOM" in done.err
