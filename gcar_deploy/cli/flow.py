@@ -71,7 +71,7 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
     from gcar_deploy.measure import lumen_tree
     from gcar_deploy.measure.lumen import tree_lumens
     from gcar_deploy.output.folder import check_target
-    from gcar_deploy.output.stored import read_folder
+    from gcar_deploy.output.stored import as_written, read_folder
 
     if out is not None:
         check_target(out, force=force, inputs=(result,))
@@ -79,8 +79,9 @@ def flow(result: Path, assumed: Assumption, out: Path | None, force: bool, talk:
     told = stored.summary
     tree, sections = stored.lumen or lumen_tree(stored.tree, None)
     found = told.get("ambiguity", {}).get("probable_ghosts", ())
-    ghosts = {ghost["branch"] - 1: ghost["probability"] for ghost in found}
-    doubts = doubts_of(told["status"], len(tree.branches), ghosts)
+    with as_written(result):
+        ghosts = {ghost["branch"] - 1: ghost["probability"] for ghost in found}
+        doubts = doubts_of(told["status"], len(tree.branches), ghosts)
     names = [branch.get("name") for branch in told["tree"]["branches"]]
     drop = pressure_drop(tree, tree_lumens(tree, sections), assumed, doubts, names)
     table = pressure_table(drop)

@@ -33,14 +33,15 @@ def info(path: Path, as_json: bool) -> None:
         model = read_model(path, (*PREDICTOR_KINDS.values(), SEGMENTER))
         click.echo(json.dumps(model.spec) if as_json else "\n".join(model_card(model)))
         return
-    from gcar_deploy.output.stored import altered_files, read_summary
+    from gcar_deploy.output.stored import altered_files, as_written, read_summary
 
     summary = read_summary(path)
-    altered = altered_files(path, summary)
+    with as_written(path):
+        altered = altered_files(path, summary)
+        told = [] if as_json else lines(path, summary)
     if as_json:
-        click.echo(json.dumps({**summary, "altered": altered}, allow_nan=False))
-    else:
-        click.echo("\n".join(lines(path, summary)))
+        told = [json.dumps({**summary, "altered": altered}, allow_nan=False)]
+    click.echo("\n".join(told))
     if altered:
         raise ToldError(UsageError(f"{path}: not as it was written: {', '.join(altered)}"))
 

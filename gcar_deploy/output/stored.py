@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import hashlib
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +18,7 @@ import numpy as np
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import is_file, is_folder, read_bounded
 from gcar_deploy.measure import Sections
+from gcar_deploy.output.misfit import misfit
 from gcar_deploy.output.tables import SECTION_COLUMNS
 from gcar_deploy.tree.tree import Branch, Tree
 from gcar_deploy.types import Array
@@ -110,18 +113,51 @@ def read_summary(path: Path) -> dict[str, Any]:
     Raises
     ------
     UsageError
-        There is none, or it is not of schema gcar-result/1.
+        There is none, it is not of schema gcar-result/1, or a value is of another kind than there.
     """
-    file = path / "result.json" if is_folder(path) else path
+    file = _summary_file(path)
     try:
-        summary = json.loads(read_bounded(file, _MOST_BYTES).decode("utf-8"))
+        text = read_bounded(file, _MOST_BYTES).decode("utf-8")
+        summary = json.loads(text, parse_constant=_no_number)
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         raise UsageError(f"{file} is not a result.json") from None
     except ValueError as error:
         raise UsageError(f"{file} {error}") from None
     if not isinstance(summary, dict) or summary.get("schema") != "gcar-result/1":
         raise UsageError(f"{file} is not of schema gcar-result/1")
+    schema = resources.files("gcar_deploy.output").joinpath("result.schema.json")
+    place = misfit(summary, json.loads(schema.read_text(encoding="utf-8")))
+    if place is not None:
+        raise UsageError(f"{file} is not as gcar wrote it: {place} is of another kind")
     return summary
+
+
+@contextlib.contextmanager
+def as_written(path: Path) -> Iterator[None]:
+    """Say of what is read out of a summary that it is not there; ``path`` as in ``read_summary``.
+
+    Raises
+    ------
+    UsageError
+        A key is missing, or a value is null that a result always has.
+    """
+    try:
+        yield
+    except KeyError as error:
+        told = f"{error} is missing"
+    except (TypeError, AttributeError, IndexError):
+        told = "a value is of another kind"
+    else:
+        return
+    raise UsageError(f"{_summary_file(path)} is not as gcar wrote it: {told}")
+
+
+def _summary_file(path: Path) -> Path:
+    return path / "result.json" if is_folder(path) else path
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"is no JSON: it holds {text}")
 
 
 def _tree(text: str, told: list[dict[str, Any]]) -> Tree:
