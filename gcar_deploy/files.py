@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import fnmatch
 import hashlib
 import os
 import re
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -17,6 +18,8 @@ _DIGITS = re.compile(r"(\d+)")
 _BLOCK = 2**20
 #: what files of a folder are called that are the frames of a run
 _FRAMES = (".png", ".tif", ".tiff", ".npy")
+#: what desktops leave in every folder that is looked at
+LEFT_BY_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
@@ -63,6 +66,19 @@ def is_file(path: str | Path) -> bool:
 def is_there(path: str | Path) -> bool:
     """Whether there is a file or folder; as ``is_folder``."""
     return os.path.exists(path)
+
+
+def is_free(folder: Path, left: Sequence[str] = ()) -> bool:
+    """Whether nothing of anybody's is in a folder: there is none, or it is empty.
+
+    Parameters
+    ----------
+    left : patterns of names that count as nothing: what the caller may have left there itself
+    """
+    ours = (*LEFT_BY_DESKTOPS, *left)
+    return not is_there(folder) or all(
+        any(fnmatch.fnmatchcase(path.name, one) for one in ours) for path in folder.iterdir()
+    )
 
 
 def check_opens(path: str | Path) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.files import is_free
 from gcar_deploy.geometry.fields import LEAST_VIEWS, MOST_VIEWS
 from gcar_export.evaluate import paper_tables, peers, tables
 from gcar_export.evaluate.engines import ENGINES, Outcome, run_in_processes, run_on_dask
@@ -143,10 +144,11 @@ def evaluate(
     ------
     UsageError
         No label volume, or none that a case can be made of; rows of other settings or label files
-        and ``changed`` is ``refuse``; no cluster.
+        and ``changed`` is ``refuse``; no cluster; ``out`` holds something else.
     ModelError
         A method's model is missing.
     """
+    _check_place(options.out)
     generated = options.protocol == "thin"
     if generated:
         known = thin_names()
@@ -195,6 +197,20 @@ def evaluate(
         raise UsageError(f"no case can be made: {next(iter(lost.values()))}")
     write_tables(rows, options.out, options.reference or options.methods[0])
     return rows
+
+
+def _check_place(out: Path) -> None:
+    """Refuse a folder that holds something, and no evaluation: its files would be replaced.
+
+    Raises
+    ------
+    UsageError
+    """
+    told = any((out / name).is_file() for name in ("settings.json", "cases.csv"))
+    ours = told and (out / "rows").is_dir()
+    # A run that was killed at once may have made no more than these.
+    if not ours and not is_free(out, ("rows", "sides")):
+        raise UsageError(f"{out} exists and holds no evaluation; choose another folder")
 
 
 def _check_own(options: EvaluateOptions) -> None:

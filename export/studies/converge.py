@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gcar_deploy.errors import UsageError
+from gcar_deploy.files import is_free
 from gcar_export.evaluate.evaluate import EvaluateOptions, evaluate
 from gcar_export.evaluate.plots import figure, style
 from gcar_export.evaluate.tables import grouped, summarise
@@ -47,13 +48,15 @@ def converge(
     Raises
     ------
     UsageError
-        A method has no steps, or a budget is below 1.
+        A method has no steps, a budget is below 1, or ``options.out`` holds something else.
     """
     wrong = [m for m in options.methods if m not in ITERATIVE]
     if wrong:
         raise UsageError(f"{', '.join(wrong)} has no steps; there are {', '.join(ITERATIVE)}")
     if not steps or min(steps) < 1:
         raise UsageError(f"steps = {tuple(steps)!r} must be numbers from 1 on")
+    if not any(options.out.glob("steps-*")) and not is_free(options.out):
+        raise UsageError(f"{options.out} exists and holds no such study; choose another folder")
     rows = []
     for k, budget in enumerate(sorted(set(steps))):
 

@@ -34,7 +34,7 @@ import numpy as np
 
 from gcar_deploy.engine import Engine
 from gcar_deploy.errors import GcarError, UsageError
-from gcar_deploy.files import whole_file
+from gcar_deploy.files import is_free, whole_file
 from gcar_deploy.geometry.carm import CArm
 from gcar_deploy.geometry.grid import Grid
 from gcar_deploy.geometry.scene import Intensity
@@ -148,8 +148,11 @@ def run(
     Raises
     ------
     UsageError
-        No such case; rows of other settings (another model or version) are in ``out``.
+        No such case; rows of other settings (another model or version) are in ``out``, or
+        something else.
     """
+    if not (out / "robustness.csv").is_file() and not is_free(out, ("*.tmp",)):
+        raise UsageError(f"{out} exists and holds no robustness.csv; give another --out")
     engine = Engine(model)
     settings = _settings(engine)
     files = find_labels(data, cases)
@@ -252,11 +255,20 @@ def draw(rows: Sequence[dict[str, str]], file: Path) -> None:
 
 
 def read_rows(file: Path) -> list[dict[str, str]]:
-    """Rows of an earlier run; none where there is no file."""
+    """Rows of an earlier run; none where there is no file.
+
+    Raises
+    ------
+    UsageError
+        Its columns are others.
+    """
     if not file.is_file():
         return []
     with file.open(newline="", encoding="utf-8") as f:
-        return list(csv.DictReader(f))
+        reader = csv.DictReader(f)
+        if tuple(reader.fieldnames or ()) != FIELDS:
+            raise UsageError(f"{file} is not that of this study; give another --out")
+        return list(reader)
 
 
 def _write_rows(file: Path, rows: Sequence[dict[str, str]]) -> None:

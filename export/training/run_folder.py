@@ -28,7 +28,7 @@ from safetensors.torch import save
 
 from gcar_deploy.batch.lock import only_one
 from gcar_deploy.errors import ModelError, UsageError
-from gcar_deploy.files import whole_file
+from gcar_deploy.files import is_free, whole_file
 from gcar_export.training.checkpoint import MEAN, WEIGHTS, best_weights, read_tensors, weights
 from gcar_export.training.run_log import draw_curve, read_log
 from gcar_export.training.scene_stream import Terminated
@@ -43,6 +43,8 @@ FREE = (
 )  # fmt: skip
 #: finite losses whose mean is logged
 RECENT = 250
+#: what a training that was stopped before its first checkpoint leaves
+_BEFORE = ("run.lock", "*.tmp", "pool", "fold-*-of-*")
 #: what a manifest takes over from the one of the run that goes on
 _KEPT = ("best", "validation", "skipped_steps")
 T = TypeVar("T")
@@ -61,7 +63,7 @@ class RunFolder:
     ------
     UsageError
         The folder holds a run of another network, size, seed, set of labels, first weights or
-        other options than those of ``FREE``, or a checkpoint without its manifest.
+        other options than those of ``FREE``, a checkpoint without its manifest, or something else.
     """
 
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
@@ -90,11 +92,13 @@ class RunFolder:
                     f"{self.checkpoint} has no manifest.json beside it, which says what it was "
                     "trained on; give another --out"
                 )
+            if not is_free(self.path, _BEFORE):
+                raise UsageError(f"{self.path} exists and holds no training; give another --out")
             return
         try:
-            before = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError:
-            raise UsageError(f"{file} is not JSON; give another --out") from None
+            before = dict(json.loads(file.read_text(encoding="utf-8")))
+        except (ValueError, TypeError):
+            raise UsageError(f"{file} is not that of a training; give another --out") from None
         now = json.loads(json.dumps(self.manifest))
         pairs = {key: (before.get(key), now.get(key)) for key in FIXED}
         old, new = before.get("options") or {}, now.get("options") or {}

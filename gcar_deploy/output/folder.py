@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gcar_deploy.errors import GcarError, UsageError
-from gcar_deploy.files import read_bounded
+from gcar_deploy.files import LEFT_BY_DESKTOPS, read_bounded
 from gcar_deploy.scratch import FRESH, OLD, scratch_folder, sweep
 
 _AT_FDCWD = -100
@@ -27,8 +27,6 @@ _WRITERS = 8
 #: the file that lists all others of a folder; the first is what ``gcar run`` writes anyway
 MANIFESTS = ("result.json", "manifest.json")
 _SCHEMA, _MOST_BYTES = "gcar-folder/1", 2**26
-#: what desktops leave in every folder that is looked at
-_LEFT_BY_DESKTOPS = {".DS_Store", "Thumbs.db", "desktop.ini"}
 
 
 def check_target(out_dir: Path, *, force: bool, inputs: tuple[Path, ...] = ()) -> None:
@@ -113,7 +111,7 @@ def manifest_of(folder: Path) -> dict[str, Any] | None:
 def in_the_way(folder: Path) -> str | None:
     """Name of something in a folder that this program did not write; None where there is none."""
     manifest = manifest_of(folder)
-    known = set(_LEFT_BY_DESKTOPS)
+    known = set(LEFT_BY_DESKTOPS)
     if manifest is not None:
         known.update(MANIFESTS, manifest["files"])
     try:

@@ -49,6 +49,21 @@ def test_a_damaged_row_is_named_and_made_anew(made, caplog, text):
     assert json.loads(file.read_text())["measures"] == whole["measures"]
 
 
+@pytest.mark.parametrize(
+    "verb",
+    [("evaluate", "--methods", "visual_hull"), ("converge", "--methods", "nerp", "--steps", "1")],
+)
+def test_a_folder_that_holds_something_else_is_refused(made, tmp_path, verb):
+    mine = tmp_path / "report.html"
+    mine.write_text("mine")
+    (tmp_path / "rows").mkdir()
+    given = ["--data", str(made / "data"), "--out", str(tmp_path), "--quiet"]
+    ended = CliRunner().invoke(main, [*verb, *given])
+    assert ended.exit_code == 2 and f"{tmp_path} exists and holds no" in ended.output
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["report.html", "rows"]
+    assert mine.read_text() == "mine" and not any((tmp_path / "rows").iterdir())
+
+
 def test_rows_that_are_left_out_are_said(made):
     ended = run(made, "--methods", "visual_hull", "--cases", "1")
     assert "3 finished rows in" in ended.stderr

@@ -83,6 +83,15 @@ def test_table_tells_means_and_statuses():
     assert "| 2 | 70.00 ± 14.14 (n=2) | 1.00 ± 0.00 (n=2) | 1 / 1 / 1 |" in table(rows)
 
 
+def test_a_folder_that_holds_something_else_is_refused(tmp_path):
+    (tmp_path / "robustness.png").write_text("mine")
+    with pytest.raises(UsageError, match=r"holds no robustness\.csv; give another --out"):
+        run(tmp_path, tmp_path)
+    (tmp_path / "robustness.csv").write_text("mine\n1\n")
+    with pytest.raises(UsageError, match=r"robustness\.csv is not that of this study"):
+        robustness.read_rows(tmp_path / "robustness.csv")
+
+
 @pytest.mark.slow
 def test_real_tree_twice_makes_each_point_once(tmp_path, monkeypatch):
     data = data_dir() / "data"

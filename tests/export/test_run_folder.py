@@ -72,6 +72,23 @@ def test_a_run_without_its_checkpoint_is_said(tmp_path, capsys):
     assert f"{tmp_path} has manifest.json and log.csv but no checkpoint.safetensors: " in said
 
 
+def test_a_folder_that_holds_something_else_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_text("mine")
+    with pytest.raises(UsageError, match="exists and holds no training; give another --out"):
+        learned(tmp_path)
+    assert [f.name for f in tmp_path.iterdir()] == ["log.csv"]
+    (tmp_path / "manifest.json").write_text("[1]")
+    with pytest.raises(UsageError, match="is not that of a training"):
+        learned(tmp_path)
+    assert (tmp_path / "log.csv").read_text() == "mine"
+    # Killed before its first checkpoint, a training goes on.
+    for name in ("a/pool", "a/fold-1-of-2"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "a" / "run.lock").write_text("")
+    learned(tmp_path / "a")
+    learned(tmp_path / "a")
+
+
 def test_a_folder_in_which_another_training_is_at_work_is_refused(tmp_path):
     with alone([RunFolder(tmp_path / "a", MANIFEST)]):
         with pytest.raises(UsageError, match=r"another training \(process \d+\) is at work in"):
