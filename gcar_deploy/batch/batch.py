@@ -11,14 +11,15 @@ from typing import Any
 
 from gcar_deploy.batch.cases import BatchCase
 from gcar_deploy.batch.lock import only_one
-from gcar_deploy.batch.pools import Pool, in_processes, on_dask
+from gcar_deploy.batch.pools import Pool, connected, in_processes, on_dask
 from gcar_deploy.batch.summary import write_summary
 from gcar_deploy.batch.work import BatchJob
 from gcar_deploy.engine_choice import EngineChoice
 from gcar_deploy.errors import UsageError
 from gcar_deploy.files import is_there, whole_file
 
-SCHEMA = "gcar-batch/1"
+#: of the file that says that a folder is a batch's, and its name
+SCHEMA, _MARK = "gcar-batch/1", "batch.json"
 #: statuses of cases that have a result folder
 _WITH_RESULT = ("ok", "degraded")
 #: called with (cases done, cases in all, name of the last)
@@ -52,18 +53,23 @@ def run_batch(
     Raises
     ------
     UsageError
-        ``out`` holds something else, another batch is at work in it, or a case changed and
-        ``force`` was not given.
+        ``out`` holds something else, another batch is at work in it, a case changed and
+        ``force`` was not given, or the scheduler does not answer; no new folder is left then.
     """
-    rows_folder = _own(out)
-    with only_one("batch", out, rows_folder / "batch.lock"):
+    new = _is_new(out)
+    with contextlib.ExitStack() as held:
+        client = None
+        if new and pool.scheduler is not None:
+            client = held.enter_context(connected(pool.scheduler))
+        rows_folder = _made(out)
+        held.enter_context(only_one("batch", out, rows_folder / "batch.lock"))
         for left in rows_folder.glob("*.running"):
             left.unlink(missing_ok=True)
         rows, missing = _known(cases, out, rows_folder, engine, pool, force=force)
         if on_case is not None:
             on_case(len(rows), len(cases), "")
         try:
-            with contextlib.closing(_done(missing, pool)) as fresh:
+            with contextlib.closing(_done(missing, pool, client)) as fresh:
                 for row in fresh:
                     _write_row(rows_folder / f"{row['case']}.json", row)
                     rows[row["case"]] = row
@@ -109,23 +115,34 @@ def _known(
     return rows, missing
 
 
-def _own(out: Path) -> Path:
-    """Make the folder, or recognise it as a batch's."""
-    mark = out / "batch.json"
-    if is_there(out) and not mark.is_file() and (not out.is_dir() or any(out.iterdir())):
+def _is_new(out: Path) -> bool:
+    """Whether there is no batch in a folder yet; refuse one that holds something else."""
+    new = not (out / _MARK).is_file()
+    if new and is_there(out) and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists and holds no batch; choose another folder")
+    return new
+
+
+def _made(out: Path) -> Path:
+    """Make the folder with its mark; return that of the rows."""
     rows = out / "rows"
     try:
         rows.mkdir(parents=True, exist_ok=True)
-        mark.write_text(json.dumps({"schema": SCHEMA}) + "\n", encoding="utf-8")
+        (out / _MARK).write_text(json.dumps({"schema": SCHEMA}) + "\n", encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{out} cannot be made ({error.strerror})") from None
     return rows
 
 
-def _done(jobs: Sequence[BatchJob], pool: Pool) -> Generator[dict[str, Any], None, None]:
-    if jobs and pool.scheduler is not None:
-        yield from on_dask(jobs, pool.scheduler)
+def _done(
+    jobs: Sequence[BatchJob], pool: Pool, client: Any
+) -> Generator[dict[str, Any], None, None]:
+    """Yield rows as they come; a cluster without a ``client`` yet is asked where a row is left."""
+    if jobs and client is not None:
+        yield from on_dask(jobs, client)
+    elif jobs and pool.scheduler is not None:
+        with connected(pool.scheduler) as found:
+            yield from on_dask(jobs, found)
     elif jobs:
         yield from in_processes(jobs, pool.processes)
 

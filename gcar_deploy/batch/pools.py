@@ -116,8 +116,9 @@ def _alone(job: BatchJob) -> dict[str, Any]:
         return {**row, "fingerprint": job.fingerprint}
 
 
-def on_dask(jobs: Sequence[BatchJob], scheduler: str) -> Iterator[dict[str, Any]]:
-    """Yield each case's row as it is done by a cluster that sees the same files.
+@contextlib.contextmanager
+def connected(scheduler: str) -> Iterator[Any]:
+    """Give the client of a Dask cluster.
 
     Raises
     ------
@@ -125,7 +126,7 @@ def on_dask(jobs: Sequence[BatchJob], scheduler: str) -> Iterator[dict[str, Any]
         The library is missing, or the scheduler does not answer.
     """
     try:
-        from distributed import Client, as_completed
+        from distributed import Client
     except ModuleNotFoundError:
         raise UsageError("distributed is not installed: pip install 'gcar[dask]'") from None
     try:
@@ -133,18 +134,23 @@ def on_dask(jobs: Sequence[BatchJob], scheduler: str) -> Iterator[dict[str, Any]
     except (OSError, ValueError) as error:
         raise UsageError(f"scheduler {scheduler} does not answer ({error})") from None
     with client:
-        # Not pure: the folder that a case writes is the point of it.
-        case_of = {
-            client.submit(
-                run_case, job, pure=False, key=f"gcar-{job.case}-{job.fingerprint[:16]}"
-            ): job
-            for job in jobs
-        }
-        for future in as_completed(list(case_of)):
-            job = case_of[future]
-            failure = future.exception()
-            if failure is None:
-                yield future.result()
-            else:
-                text = f"its worker failed: {type(failure).__name__}"
-                yield {**error_row(job.case, "failed", text, 1), "fingerprint": job.fingerprint}
+        yield client
+
+
+def on_dask(jobs: Sequence[BatchJob], client: Any) -> Iterator[dict[str, Any]]:
+    """Yield each case's row as it is done by a cluster that sees the same files."""
+    from distributed import as_completed
+
+    # Not pure: the folder that a case writes is the point of it.
+    case_of = {
+        client.submit(run_case, job, pure=False, key=f"gcar-{job.case}-{job.fingerprint[:16]}"): job
+        for job in jobs
+    }
+    for future in as_completed(list(case_of)):
+        job = case_of[future]
+        failure = future.exception()
+        if failure is None:
+            yield future.result()
+        else:
+            text = f"its worker failed: {type(failure).__name__}"
+            yield {**error_row(job.case, "failed", text, 1), "fingerprint": job.fingerprint}

@@ -318,6 +318,9 @@ def test_on_a_dask_cluster(table, tmp_path, monkeypatch):
         )
     assert [row["exit_code"] for row in rows] == [0, 3]
     assert (tmp_path / "out" / "good-1" / "result.json").is_file()
+    # What is done asks no cluster.
+    gone = pools.Pool(scheduler="tcp://127.0.0.1:9")
+    assert run_batch(cases, tmp_path / "out", ENGINE, pool=gone) == rows
 
 
 def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
@@ -326,6 +329,11 @@ def test_a_scheduler_that_is_not_there(table, tmp_path, monkeypatch):
     absent = pools.Pool(scheduler="tcp://127.0.0.1:9")
     with pytest.raises(UsageError, match="does not answer"):
         run_batch(read_cases(table), tmp_path / "o", ENGINE, pool=absent)
+    assert not (tmp_path / "o").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("1")
+    with pytest.raises(UsageError, match="holds no batch"):
+        run_batch(read_cases(table), tmp_path / "mine", ENGINE, pool=absent)
     done = gcar("batch", table, "--out", tmp_path / "p", "--engine", "dask")
     assert done.code == 2 and "--scheduler" in done.err
 
