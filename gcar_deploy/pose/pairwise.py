@@ -50,7 +50,7 @@ from gcar_deploy.types import Array, Image, Pixels
 SAID_SHIFT_MM, SAID_TURN_DEG = 2.0, 1.0
 #: calibrated pictures that differ as they are told by no more times what their pixels alone make of
 #: it are left alone
-AGREED_GRAIN = 3.0
+AGREED_GRAIN = 2.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

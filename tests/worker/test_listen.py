@@ -70,9 +70,12 @@ def associate(port, *kinds, title="GCAR"):
     return entity.associate("127.0.0.1", port, ae_title=title)
 
 
-def wait_for(queue, count):
+def wait_for(queue, count, lines=None):
+    """Until so many jobs have ended and, where they are given, as many lines said so."""
     end = time.monotonic() + 60
-    while sum(queue.counts().get(s, 0) for s in ("done", "failed")) < count:
+    while sum(queue.counts().get(s, 0) for s in ("done", "failed")) < count or (
+        lines is not None and len(lines) < count
+    ):
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -87,7 +90,7 @@ def test_a_study_is_ordered_once_its_sender_lets_go(listening, runs, tmp_path):
         assert link.send_c_store(one).Status == 0
     assert orders == []
     link.release()
-    wait_for(queue, 1)
+    wait_for(queue, 1, lines)
     ((out, views),) = orders
     assert out == tmp_path / study and len(views) == 2
     assert [pydicom.dcmread(io.BytesIO(v)).PixelData for v in views] == [d.PixelData for d in data]
